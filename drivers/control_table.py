@@ -1,7 +1,6 @@
 """Control tables: the registers of each servo model and their addresses.
 
 They are read from the `.model` files of the `dynamixel-sdk` package (one per model, tab-separated), not copied here.
-The files contain addresses and sizes; the ROBOTIS e-Manual explains the meaning of each register.
 """
 
 from collections.abc import Mapping

@@ -83,9 +83,8 @@ class Joint:
     def within_turn(self, position_ticks: int) -> "Joint":
         """Return this joint with its zero shifted by whole turns, so that its angle is closest to `near`.
 
-        Without `near`, the joint is returned unchanged. At power-up, a servo measures its position within one turn and
-        counts turns from there. The reading of a joint that rests just beyond the end of that turn is therefore off by
-        a whole turn.
+        Without `near`, the joint is returned unchanged. At power-up, a servo starts within one turn, so the reading of
+        a joint that rests just beyond the end of that turn is off by a whole turn.
         """
         if self.near is None:
             return self

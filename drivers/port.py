@@ -56,7 +56,7 @@ _ALWAYS = 1 << 62
 
 _EARLY_BITS = 9.0
 """Assumed number of bits per transmitted byte. A reply counts as early if it arrives before the request can have been
-transmitted with this many bits per byte. The true number is ten; the difference allows for inaccurate baud rates.
+transmitted with this many bits per byte. The true number is ten.
 """
 
 _BAUD_TOLERANCE = 0.03
@@ -197,8 +197,8 @@ class Port:
     def ask(self, data: bytes, count: int, expected: ReplyTime, start: float) -> bytes:
         """Write at `start` [s, on the port's clock], then read until the timeout, as the control cycle does.
 
-        Pending input is set aside first: otherwise a duplicated or late reply would be taken for the reply to this
-        request, and every later reply would be one cycle late.
+        Pending input is set aside first: otherwise a late reply would be taken for the reply to this request, and every
+        later one would be a cycle late.
         """
         if self.has_input():
             self.put_aside()
@@ -298,10 +298,7 @@ class NetworkPort(Port):
 
 
 class DescriptorPort(Port):
-    """A local device, read and written through its file descriptor.
-
-    pyserial opens and configures it as non-blocking, with VMIN = VTIME = 0.
-    """
+    """A local device, read and written through its file descriptor."""
 
     def __init__(self, url: str, baud: int, opened: Any) -> None:
         super().__init__(url, baud, opened)

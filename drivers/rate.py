@@ -27,8 +27,7 @@ _tick = partial(tuple.__new__, Tick)  # half the time of Tick(...)
 class FixedRate:
     """Deadlines at `rate` per second; the first is one interval after the first call of `wait`.
 
-    After a stall, each missed deadline is returned without waiting, marked as missed and counted in `missed`. A caller
-    that plays back samples thus stays in step with the clock without sending a burst.
+    After a stall, each missed deadline is returned without waiting, marked as missed and counted in `missed`.
     """
 
     def __init__(self, clock: Clock, rate: float) -> None:
@@ -39,7 +38,6 @@ class FixedRate:
         self.missed = 0
 
     def wait(self) -> Tick:
-        """Wait for the next deadline and return it."""
         if self._start is None:
             self._start = self._clock.now() + self._interval
         deadline = self._start + self._index * self._interval

@@ -22,7 +22,7 @@ class SdkPort:
     """Adapts our open port to `dynamixel-sdk`, removing the echo of an adapter that receives its own transmissions.
 
     Unlike in the SDK's own port, reads block instead of polling, and time is the port's clock. A failure cannot leave
-    the port marked as in use, which would make it impossible to cut torque. The method names are the SDK's.
+    the port marked as in use, which would keep torque from being cut. The method names are the SDK's.
     """
 
     def __init__(self, port: Port) -> None:

@@ -90,8 +90,8 @@ class NoLoad(NamedTuple):
 class Published(NamedTuple):
     """A published torque constant: the median, lowest and highest of the figures.
 
-    It is uncertain even where the figures agree: the stall torque is a servo's peak torque, friction included, and an
-    individual servo's can differ by tens of percent. If it matters, measure the constant with a known weight.
+    It is uncertain even where the figures agree: an individual servo's stall torque can differ by tens of percent. If
+    it matters, measure the constant with a known weight.
     """
 
     value: float
@@ -152,8 +152,7 @@ class ServoModel:
         """Whether a current falls short of its goal because the supply cannot drive more through the turning motor.
 
         This is taken as the cause if the motor turns in the direction of its goal and the voltage across its terminals
-        (voltage drop of the winding plus back-EMF) is about the supply voltage. Without torque, only the back-EMF is
-        present. A current opposite to its goal has another cause.
+        (voltage drop of the winding plus back-EMF) is about the supply voltage.
 
         goal, carried: commanded and measured current [A]. velocity: velocity of the output shaft [rad/s]. supply:
         lowest measured voltage of the supply [V]; NaN if unknown, in which case the lowest plausible voltage is
@@ -186,8 +185,8 @@ class ServoModel:
     def torque_per_volt(self) -> Published:
         """Torque at the output shaft per volt at standstill [N m/V]: stall torque divided by supply voltage.
 
-        In PWM mode, the motor torque is this value times the applied voltage, minus the effect of the back-EMF, which
-        identified viscous friction then includes.
+        In PWM mode, the motor torque is this value times the applied voltage, minus the back-EMF, which identified
+        viscous friction then includes.
         """
         return _spread([stall.torque / stall.voltage for stall in self.stalls])
 

@@ -51,7 +51,6 @@ _ARMATURE_SHARE = Guess(2.5e-3, 0.5)  # kg m^2 per N m
 
 
 def servo_prior(model: ServoModel) -> ServoPrior:
-    """Return the prior for a model."""
     stall, family = stall_torque(model), model.name.split("-")[0]
     share = _SMALL_COULOMB_SHARE if family in _SMALL else _COULOMB_SHARE
 

@@ -51,8 +51,8 @@ class Span:
     def each(cls, tables: Sequence[ControlTable], registers: Sequence[Sequence[str]]) -> "tuple[Span, ...]":
         """Return one span per table, with `registers[i]` of `tables[i]`, all covering the same range of addresses.
 
-        The range ends where every table defines a register: a servo refuses a read that ends at an undefined address.
-        Raises KeyError if a table lacks one of its registers, ValueError if there is no such range.
+        A servo refuses a read that ends at an undefined address. Raises KeyError if a table lacks one of its registers,
+        ValueError if there is no such range.
         """
         own = [cls._in(table, names) for table, names in zip(tables, registers, strict=True)]
         start = min(span.address for span in own)
@@ -266,7 +266,6 @@ class FastSyncRead:
         return [packet[start + 1] for _, start in self._intact(packet)]
 
     def _packet(self, received: bytes) -> bytes:
-        """Return the received bytes from the start of the status packet."""
         at = received.find(self._front)
         return received[at:] if at >= 0 else b""
 

@@ -9,8 +9,8 @@ NEVER = 1 << 62
 class Turns:
     """Counts cycles until spans other than the usual one are due.
 
-    A cycle only decrements one counter, the number of usual cycles returned by `plan`. From this counter, `count`
-    derives how many cycles have passed.
+    A cycle only decrements the number of usual cycles returned by `plan`, from which `count` derives how many have
+    passed.
 
     slow_spans: number of slow spans. slow_every: samples between two of them. status_every: cycles between two status
     reads.
@@ -51,7 +51,6 @@ class Turns:
         return self._slow
 
     def read_status_next(self) -> None:
-        """Make the status due in the next cycle."""
         if self._status_every < NEVER:
             self._until_status = min(self._until_status, 1)
 

@@ -1,14 +1,13 @@
 """Torque constants from a known mass, by maximum likelihood over two settled periods, without and with the mass.
 
-Every parameter of a joint scales with its torque constant, so a single experiment cannot determine the constant. A mass
-M bolted to the last link at a known distance changes the arm's parameters by amounts that are known in kilograms and
-metres:
+Every parameter of a joint scales with its torque constant. A mass M bolted to the last link at a known distance changes
+the arm's parameters by amounts that are known in kilograms and metres:
 
     gravity_2 + M d g    inertia_2 + M d^2 + J    coupling + M l1 d    gravity_1 + M l1 g    inertia_1 + M l1^2
     (one joint: gravity_1 + M d g, inertia_1 + M d^2 + J)
 
-Both periods are fitted together. The second period's parameters are the first's plus these amounts, and each joint's
-torque is the commanded one times an unknown factor: the ratio of true to assumed torque constant.
+Both periods are fitted together. Each joint's torque is the commanded one times an unknown factor: the ratio of true to
+assumed torque constant.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,7 @@
 """Compiled loops whose disk cache is invalidated by any change in the code or constants compiled into them.
 
-numba stores compiled code next to the source and checks only the date of that one file. Functions inlined from other
-modules, and constants taken from them, could therefore be older than their sources; and if a file changes while a
-program starts, old code could be stored under the new date. So the cache is stamped with a hash of the loaded code.
+numba stores compiled code next to the source and checks only the date of that one file. Functions and constants inlined
+from other modules could therefore be older than their sources. So the cache is stamped with a hash of the loaded code.
 """
 
 import hashlib
@@ -38,9 +37,8 @@ def inner(function: Any, **options: Any) -> Any:
 def only_version(dispatcher: Any) -> Any:
     """Return the machine code of a compiled function that has been called with arguments of one set of types.
 
-    Calling it skips the lookup of the argument types, which takes 0.1 us per array, as long as a small loop. Use it
-    only where the arguments' types never change. Without a compiler (NUMBA_DISABLE_JIT), and if there are several
-    versions, the function is returned unchanged.
+    Calling it skips the lookup of the argument types, 0.1 us per array. Use it only where these types never change.
+    Without a compiler (NUMBA_DISABLE_JIT) or with several versions, the function is returned unchanged.
     """
     versions = list(getattr(dispatcher, "overloads", {}).values())
     return versions[0].entry_point if len(versions) == 1 else dispatcher

@@ -30,8 +30,8 @@ class Estimate(FittedParameters):
     `std` and `covariance` are the uncertainty due to position errors. They are scaled by the actual residual and
     widened if it is correlated (`hil.estimator.fit.covariance`), so they include the true effect of rounding (a
     residual of 0.2887 encoder steps RMS is rounding alone). They do not include systematic errors of the torque
-    constant (all parameters of a joint scale with it), of the encoder's zero or linearity, or of the model. A residual
-    well above 0.29 steps means that the model is incomplete and that the parameters may be off by more than `std`.
+    constant, of the encoder's zero or linearity, or of the model. A residual well above 0.29 steps means that the model
+    is incomplete and that the parameters may be off by more than `std`.
     """
 
     model: Model

@@ -1,9 +1,8 @@
 """numpy's linear algebra and scipy's least squares for the estimator, with failures raised as estimator errors.
 
 Matrices that are not finite, because a simulated motion diverged or a parameter lost its effect, make decompositions
-fail with numpy's LinAlgError. Callers of an estimate do not handle this error: a search over models would stop with a
-traceback instead of trying the next model. `least_squares` fails on such residuals with a ValueError. Therefore
-`hil.estimator` and `hil.estimation` take these functions from here.
+fail with numpy's LinAlgError. With that error, a search over models would stop with a traceback instead of trying the
+next model. Therefore `hil.estimator` and `hil.estimation` take these functions from here.
 """
 
 import re

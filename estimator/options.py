@@ -1,8 +1,7 @@
 """Options of the fits: tolerances, limits and initial guesses, in one frozen object per fit.
 
 Names follow scipy.optimize: `ftol` is the relative decrease of the sum of squares below which a fit has converged,
-`max_iterations` the maximum number of iterations. All published figures of this project were measured with the
-defaults.
+`max_iterations` the maximum number of iterations.
 """
 
 from dataclasses import dataclass
@@ -129,10 +128,7 @@ class LikelihoodOptions:
     """Minimum relative increase of the sum of squares for which the fit is repeated with the heavier priors."""
 
     initial_widths: tuple[float, ...] = (0.005, 0.05)
-    """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried.
-
-    Starting from a narrow step, the fit of a wide one may end in a local minimum, and vice versa.
-    """
+    """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried."""
     initial_bends: tuple[float, ...] = (1e-3, 5e-3)
     """Initial presliding deflection at which the joint begins to slide [rad], one for each of `initial_widths`."""
     min_initial_lag: float = 1e-4
@@ -276,8 +272,8 @@ class SelectionOptions:
     max_wave_peaks: int = 3
     """Maximum number of spatial frequencies (cycles per turn) from which fits with ripple or cogging start."""
     wave_evidence: float = 0.05
-    """Minimum evidence in the score test for ripple or cogging to be tried. The threshold is lenient because the test
-    finds the wave's period only roughly; a fit that includes the wave explains more.
+    """Minimum evidence in the score test for ripple or cogging to be tried. It is low because the test finds the wave's
+    period only roughly.
     """
     prune_levels: tuple[float, ...] = (1e-3, 0.1)
     """Significance levels for removing terms, tried in turn until the reduced model explains the motion equally well.

@@ -200,7 +200,6 @@ def found_beside(folder: Path, name: str) -> Path:
 
 
 def _known_names(name: str) -> str:
-    """Return a hint for a bare name that does not name an arm."""
     if "." in name or "/" in name:
         return ""
     close = get_close_matches(name, arm_names(), 1, 0.75)

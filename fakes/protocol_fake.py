@@ -42,8 +42,8 @@ class _Unplugged(serial.SerialException):
 class FakeSerial(SerialBase):
     """A pyserial port connected to a fake bus.
 
-    The arm is created when the port is first opened and lives as long as the port object: when the port is reopened,
-    the arm is as it was left, except that time has passed, as with real servos. Two port objects never share an arm.
+    The arm is created when the port is first opened and lives as long as the port object. Two port objects never share
+    an arm.
 
     It has the attributes `clock` and `bus` in addition to pyserial's interface.
     """
@@ -120,8 +120,8 @@ class FakeSerial(SerialBase):
     def read(self, size: int = 1) -> bytes:
         """Return up to `size` bytes, waiting on `clock` for at most the port's timeout.
 
-        With timeout None, a real port would wait forever for bytes that never arrive. Since nothing else can send them
-        here, such a read raises `serial.SerialException`; bytes already received can still be read.
+        Where a real port with timeout None would wait forever, this read raises `serial.SerialException`; bytes already
+        received can still be read.
         """
         bus = self._open_bus()
         timeout = self._timeout

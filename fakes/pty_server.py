@@ -30,7 +30,6 @@ OVERRUN_S = 1e-3
 
 TOO_SLOW_S = 5e-3
 """If simulating the arm takes this much longer than the simulated time twice in a row, the excess is not simulated [s].
-After a single stall of the computer, the arm catches up instead.
 """
 
 LONGEST_SLEEP_S = 0.05
@@ -248,8 +247,7 @@ def _baud_of(master: int) -> int:
 def _wake_up_in_time() -> None:
     """Ask Linux for microsecond timers and real-time scheduling of the serving thread.
 
-    Without them, each wait ends about 50 us late, and on a busy computer the servos would fall silent for many
-    milliseconds, unlike real ones.
+    Without them, the servos would fall silent for many milliseconds on a busy computer.
     """
     with contextlib.suppress(OSError):  # not permitted: the server then competes with all other programs
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))

@@ -15,7 +15,7 @@ Both accept the path of a TOML file with a [fake] table, the name of a bundled a
 "open_manipulator_x"), a `hil.fakes.description.FakeArm`, or nothing for the default arm. `seed` and `faults` override
 those of the description.
 
-pytest loads this module in every session if hil is installed, so it imports only what pytest itself needs.
+pytest loads this module in every session, so it imports only what pytest itself needs.
 """
 
 from collections.abc import Callable, Iterator, Sequence

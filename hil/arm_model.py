@@ -1,7 +1,7 @@
 """An identified arm as a model: inverse and forward dynamics, gravity and friction. Needs numpy only.
 
 Equations and names are as in docs/model.md. The last axis of every array runs over the joints; any axes may come before
-it, so a single pose, a trajectory and a batch of trajectories are all accepted.
+it.
 """
 
 from collections.abc import Mapping

@@ -1,7 +1,7 @@
 """An identified spatial arm as a model; see `hil.arm_model`. Needs numpy only.
 
 Newton-Euler equations in which the base parameters replace the links' own inertial parameters, and all eliminated
-parameters are zero. The dynamics stay the same, but a mass of zero says nothing about the real link.
+parameters are zero.
 """
 
 from dataclasses import dataclass
@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hil.arm_model import ArmModel, Array
+from hil.arm_model import ArmModel
+from hil.estimator.arrays import Array
 from hil.estimator.chain.model.tilt import TILT, tilted
 
 _INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))

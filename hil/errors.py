@@ -83,8 +83,8 @@ class Cause(Enum):
         """Whether the servos still accept commands, so that an arm may be lowered under supervision.
 
         A servo that has lost its watchdog still obeys; if the watchdog had tripped, the loss of torque would be
-        detected during lowering. If replies are missing, lowering continues for a moment without them, because they may
-        come back. A servo that has set its alert bit may still have torque; its torque state is read first.
+        detected during lowering. A servo that has set its alert bit may still have torque; its torque state is read
+        first.
         """
         others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
         others |= {Cause.MISSING, Cause.ALERT}

@@ -52,7 +52,6 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _no_result(folder: Path) -> str:
-    """Say what a folder without a result lacks, and the command that provides it."""
     if (folder / "samples.npy").is_file():
         return (
             f"{folder} has no result.json: its identification did not finish. Estimate it first: "

@@ -19,7 +19,6 @@ class ResultConsole(Console):
 
 
 def result_console() -> Console:
-    """Return a console that prints results on standard output."""
     return ResultConsole(highlight=False)
 
 

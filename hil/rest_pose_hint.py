@@ -10,9 +10,8 @@ def within_limits(position: float, limits: Sequence[float]) -> float:
     """Return `position` if it is within the limits, otherwise the angle a whole number of turns away that is nearest to
     their middle.
 
-    An encoder only measures the angle within one turn, and a servo does not count turns while it is off. `position`
-    assumes the turn closest to the rest pose or to zero, but the joint must be at an angle that it can reach. If no
-    turn is within the limits, the result is the one that is least beyond them. All angles are in rad.
+    A servo does not count turns while it is off, and `position` assumes the turn closest to the rest pose or to zero.
+    If no turn is within the limits, the result is the one that is least beyond them. All angles are in rad.
     """
     low, high = limits
     if low <= position <= high:

@@ -147,14 +147,12 @@ def _field_of(detail: Any, root: type[BaseModel]) -> Any:
 
 
 def _brackets_hint(key: str, detail: Any) -> str:
-    """Say how to write a list of tables, if a single table was given instead."""
     if detail["type"] not in {"list_type", "tuple_type"} or not isinstance(detail["input"], dict):
         return ""
     return f". Write [[{key}]] with double brackets, once for each entry, instead of [{key}]"
 
 
 def _as_list(detail: Any, joints: int | None) -> str:
-    """Say what to write instead of a number where a list with one entry per joint is expected."""
     value = detail["input"]
     if joints is None or detail["type"] != "list_type" or isinstance(value, bool) or not isinstance(value, int | float):
         return ""

@@ -43,7 +43,7 @@ OTHER_UNITS: dict[str, tuple[tuple[_Unit, ...], ...]] = {
     FRACTION: ((("percent", 1e-2), ("per mille", 1e-3)),),
 }
 """Units that people use for a quantity, as multiples of its unit. In each group, only the first unit that makes sense
-is proposed; the groups are different kinds of unit (for torque, newton metres and kilogram-force centimetres).
+is proposed.
 """
 
 _LEAST = {"m/s^2": 1.5, "m": 1e-2, "samples per second": 1.0}
@@ -62,16 +62,13 @@ def unit_of(description: str | None) -> str | None:
     return FRACTION if _FRACTION.search(text) else None
 
 
-def in_other_units(
-    values: float | Sequence[float], unit: str | None, makes_sense: Callable[[float], bool], most: int = 3
-) -> str:
-    """Return "If it is in ms, write 10" for the other units in which every value makes sense; "" if there are none.
+def in_other_units(values: float | Sequence[float], unit: str | None, makes_sense: Callable[[float], bool]) -> str:
+    """Return "If it is in ms, write 10" for up to three other units in which every value makes sense, or "".
 
     Args:
         values: the given number or list; for a list, the proposal is a list too.
         unit: the expected unit.
         makes_sense: whether a value in that unit is allowed and plausible.
-        most: largest number of proposals.
     """
     given = [values] if isinstance(values, int | float) else list(values)
     least = _LEAST.get(unit or "", 0.0)
@@ -83,7 +80,7 @@ def in_other_units(
     for name, factor in _fitting(given, OTHER_UNITS.get(unit or "", ()), is_meant):
         converted = ", ".join(f"{value * factor:.4g}" for value in given)
         proposals.append(f"in {name}, write {converted if isinstance(values, int | float) else f'[{converted}]'}")
-    return f"If it is {'; if '.join(proposals[:most])}" if proposals else ""
+    return f"If it is {'; if '.join(proposals[:3])}" if proposals else ""
 
 
 def _fitting(

@@ -6,7 +6,7 @@ __all__ = ["ForeignValues"]
 
 ENOUGH, WITHIN_S = 3, 10.0
 """This many values not written by this program, read within this time [s], prove that something else writes to the
-servo or alters what is written. Noise cannot alter a value, since the checksum would fail.
+servo or alters what is written.
 """
 
 

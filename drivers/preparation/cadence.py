@@ -17,8 +17,8 @@ STATUS_S = 0.035
 """Time between two status reads [s]."""
 
 _SHARE, _MOST_SHARE = 0.6, 0.9
-"""Fraction of a control cycle that a status read may take on the wire; the rest is for the adapter and the computer.
-The second value applies to servos that report the supply current, which is slow to reveal a loss of torque.
+"""Fraction of a control cycle that a status read may take on the wire. The second value applies to servos that report
+the supply current, which is slow to reveal a loss of torque.
 """
 
 

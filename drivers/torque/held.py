@@ -51,7 +51,6 @@ def switched_on(servos: Mapping[Joint, Servo]) -> str:
 
 
 def _current(joint: Joint, servo: Servo) -> str:
-    """Return the servo's present current in parentheses; "" if it does not measure one."""
     if joint.servo.current_unit is None:
         return ""
     return f" (Present Current {servo.read('Present Current') * joint.servo.current_unit:.3f} A)"

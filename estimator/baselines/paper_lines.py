@@ -2,8 +2,8 @@
 line.
 
 This is the corrected form, second order with damping: (s^2 D + s F + K) q = tau on every line, with D and K of the arm
-linearised at (-pi/2, 0). It is valid for small swings without dry friction; for other motions, its result shows the
-linearisation error. Zhu et al., Machines 10 (2022) 392, equations (13), (48), (52) to (69); docs/paper.md.
+linearised at (-pi/2, 0). It is valid for small swings without dry friction. Zhu et al., Machines 10 (2022) 392,
+equations (13), (48), (52) to (69); docs/paper.md.
 """
 
 from dataclasses import dataclass

@@ -2,8 +2,7 @@
 
 Position passes through a causal low-pass filter and is differenced; the regressor is evaluated and filtered again. The
 torque passes through the same filter twice, so that both have the same lag. Every sample then corrects the parameters
-once: Ljung, System Identification (1999), section 11.2, with a forgetting factor of 1, which is optimal for an arm that
-does not change.
+once: Ljung, System Identification (1999), section 11.2, with a forgetting factor of 1.
 """
 
 from collections.abc import Sequence
@@ -29,8 +28,7 @@ def fit_recursively(
     to their residuals.
 
     `cutoff` [Hz], `coulomb_width` [rad/s] and `delay` [s] are as in
-    `hil.estimator.baselines.idim.fit_inverse_dynamics`. The weights come from a first pass over the data, an advantage
-    that an on-line estimator does not have.
+    `hil.estimator.baselines.idim.fit_inverse_dynamics`. The weights come from a first pass over the data.
     """
     rows = [_causal_rows(recording, cutoff, coulomb_width, delay) for recording in recordings]
     Y = np.concatenate([row[0] for row in rows], axis=1)

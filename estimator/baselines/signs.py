@@ -66,7 +66,6 @@ class Signs:
 
 
 def _columns(kind: str, signs: Sequence[int], names: Sequence[str]) -> str:
-    """The reversed columns of one kind, as text; "" if there are none."""
     found = [name for name, sign in zip(names, signs, strict=True) if sign < 0]
     if len(found) < 2:
         return f"the {kind} of {found[0]}" if found else ""
@@ -179,8 +178,7 @@ def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | No
 def suspect_order(recordings: Sequence[Recording], torques: bool = True) -> tuple[float, float] | None:
     """Return evidence that the angles of two joints, and by default also their torques, are in the opposite order.
 
-    See `suspect_swapped` for the result. The outer joint's zero angle may be unknown until the columns have been
-    exchanged.
+    See `suspect_swapped` for the result.
     """
     if recordings[0].joints != 2:
         return None

@@ -1,8 +1,8 @@
 """Torque constants of a spatial arm from a known mass: one fit to two settled periods, without and with the mass.
 
-A single recording determines only the ratios of the torque constants. A known mass on a link changes the base
-parameters by amounts known in kilograms and metres. In units of the first joint's assumed torque constant, this change
-appears multiplied by the ratio of assumed to true constant, which is a parameter of the fit (`ADDED_MASS`).
+A known mass on a link changes the base parameters by amounts known in kilograms and metres. In units of the first
+joint's assumed torque constant, this change appears multiplied by the ratio of assumed to true constant, which is a
+parameter of the fit (`ADDED_MASS`).
 """
 
 from dataclasses import dataclass

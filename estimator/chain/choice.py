@@ -81,7 +81,6 @@ def choose_chain(
 
 
 def _richer(model: ChainModel) -> list[ChainModel]:
-    """Return the models with one more term."""
     more = [] if model.zeros or model.joints == 1 else [replace(model, zeros=True)]
     if model.friction == "coulomb":
         more.append(replace(model, friction="stribeck"))

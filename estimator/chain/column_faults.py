@@ -1,8 +1,8 @@
 """Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, wrong times.
 
 As for planar arms (`hil.estimator.baselines.signs`), the torque residual of filtered inverse dynamics with a column
-changed is compared with that of the columns as given. Signs and factors of torques only change how the normal equations
-of the joints are added up, so all combinations can be tried; reversed angles and other times need a new regressor.
+changed is compared with that of the columns as given. Signs and factors of torques only change how the joints' normal
+equations are added up, so all combinations can be tried.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,10 +12,9 @@ from functools import cached_property
 from itertools import combinations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.estimator import linalg
-from hil.estimator.arrays import Array
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.baselines.signs import Signs
 from hil.estimator.chain.fit.regression import filtered_torques
 from hil.estimator.chain.fit.stage1 import PASSES
@@ -24,8 +23,6 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.recordings import CUTOFFS, LAG
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError, RecordingError
-
-Mask = NDArray[np.bool_]
 
 SUSPICIOUS = 0.1  # relative torque residual of the worst joint, below which only contradictory torques are sought
 CLEAR = 0.5  # largest ratio of the worst joint's residuals, with a change and as given
@@ -220,8 +217,7 @@ class ColumnCheck:
     def contradictory_torques(self) -> tuple[float, ...] | None:
         """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better.
 
-        The links' prior is weak and friction absorbs much of an error, so a small gain is evidence; the likelihood can
-        decide then.
+        The links' prior is weak and friction absorbs much of an error, so a small gain is evidence.
         """
         normal, given = self._given
         factors, best = np.ones(self.model.joints), given
@@ -309,7 +305,6 @@ class _Normal:
 
 
 def _driven(columns: Array, torque: Array) -> tuple[Array, Array]:
-    """Return `products` and `torque` of normal equations."""
     products = np.stack([Y.T @ tau for Y, tau in zip(columns, torque, strict=True)]) / torque.shape[1]
     return products, np.maximum(np.mean(torque**2, axis=1), 1e-18)
 

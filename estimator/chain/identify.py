@@ -32,8 +32,7 @@ SYSTEMATIC = 1.1
 white noise exceeds this value.
 
 The ratio is 0.6 to 0.9 for encoder rounding and noise. Torque ripple of 0.2 %, or load-dependent friction of 0.3 % of
-the torque, raises it to 2 or 3, while the residual still exceeds the noise by less than a tenth. With a noisy encoder,
-load-dependent friction of one joint raises it to 1.5 or more.
+the torque, raises it to 2 or 3; with a noisy encoder, load-dependent friction of one joint raises it to 1.5.
 """
 
 SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005
@@ -166,7 +165,7 @@ def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int
 def largest_ratio(one: Array, other: Array) -> float:
     """Return the largest element-by-element ratio of two vectors of standard errors; infinite if no pair is finite.
 
-    The largest ratio is used, not the median, because an unmodelled effect may act on only one joint.
+    An unmodelled effect may act on only one joint.
     """
     known = np.isfinite(one) & np.isfinite(other)
     return float(np.max(one[known] / other[known])) if known.any() else np.inf

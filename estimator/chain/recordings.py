@@ -1,8 +1,8 @@
 """Estimation of chains from recordings of arbitrary motion; no settled period is needed.
 
 Stage 1 is filtered inverse dynamics. Stage 2 is the same likelihood as for settled periods: its observer needs
-commanded torque, but no periodic motion. A measured torque already responds to the motion, so a simulation driven by it
-adds no information (docs/theory.md); in that case the regression's result is returned, and marked as such.
+commanded torque, but no periodic motion. A simulation driven by a measured torque adds no information (docs/theory.md);
+in that case the regression's result is returned, and marked as such.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ VELOCITY_SAMPLES = 9  # at the beginning, from which the initial velocity is tak
 class MotionPiece(SettledPeriod):
     """A recording resampled at equal intervals for the likelihood of settled periods; its motion need not be periodic.
 
-    The torque before the first sample is assumed to be that of the last sample; the initial state absorbs the error.
+    The torque before the first sample is assumed to be that of the last sample.
     """
 
     def __post_init__(self) -> None:

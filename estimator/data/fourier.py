@@ -50,11 +50,10 @@ def white_noise(position: Array, valid: Mask | None = None) -> Array:
     """Return the standard deviation (joints,) [rad] of the white noise in one period of angles (joints, samples) [rad].
 
     It is estimated from the upper quarter of the lines, far above the frequencies of any motion. A linear trend is
-    removed first: if the arm drifts, the two ends of a period do not match, and the jump between them would spread over
-    all lines.
+    removed first, since the jump between the ends of a period would spread over all lines.
 
-    valid: samples that were received (joints, samples); the others are interpolated linearly, which reduces noise at
-    high frequencies. The result is corrected for this with simulated white noise that is interpolated in the same way.
+    valid: samples that were received (joints, samples); the others are interpolated linearly, and the result is
+    corrected for the effect of this on white noise.
     """
     noise = _upper_noise(without_jump(position))
     if valid is None or valid.all():

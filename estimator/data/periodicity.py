@@ -51,9 +51,8 @@ def settling_difference(former: Array, latest: Array) -> float:
     """Return the RMS difference of a period (joints, samples) [rad] from the previous one, relative to the motion's
     RMS.
 
-    The value is that of the worst joint. Only the second halves are compared. If they agree, the motion had settled
-    before the end of the previous period. The latest one is then settled as a whole, even if the previous one began
-    with the transient of the ramp. This saves a whole period of the experiment.
+    The value is that of the worst joint. Only the second halves are compared. If they agree, the latest period is
+    settled as a whole, even if the previous one began with the transient of the ramp.
     """
     half = former.shape[1] // 2
     return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())
@@ -72,8 +71,8 @@ class Decay:
     def is_warming(self, correlation: float) -> bool:
         """Return whether the change looks like friction falling during warm-up rather than a transient.
 
-        As the arm warms up, friction decreases over many periods, so the motion keeps changing in the same direction. A
-        transient oscillates at the arm's own frequencies, or decays faster. correlation: see `correlation_of_changes`.
+        During warm-up the motion keeps changing in the same direction over many periods; a transient oscillates or
+        decays faster. correlation: see `correlation_of_changes`.
         """
         return self.ratio >= SLOWLY and correlation >= ALIKE
 
@@ -82,8 +81,7 @@ def decay_of(differences: Sequence[float], within: float) -> Decay | None:
     """Return the decay of the relative differences of successive periods, and how many periods it takes to reach
     `within`.
 
-    Returns None if the differences do not decrease steadily, as those of a transient or of warm-up do; backlash, a
-    dragging cable or bumps make them irregular.
+    Returns None if the differences do not decrease steadily.
 
     differences: in chronological order; the first may contain the transient of the ramp.
     """

@@ -1,10 +1,9 @@
 """Noise of the angles, estimated from the difference between two passes of the same periodic motion.
 
-Whatever repeats with the motion cancels: the motion itself, however fast, and the error of any model of it. What
-remains of a rounded angle depends on its noise. Without noise, both passes are rounded identically and nothing remains;
-the more noise there is before rounding, the more the rounding errors differ. With independent Gaussian noise of
-standard deviation s, a slow drift d from one pass to the next, and angles spread evenly over the steps, half the mean
-square of the difference at high frequencies is
+Whatever repeats with the motion cancels. Without noise, both passes are rounded identically and nothing remains; the
+more noise there is before rounding, the more the rounding errors differ. With independent Gaussian noise of standard
+deviation s, a slow drift d from one pass to the next, and angles spread evenly over the steps, half the mean square of
+the difference at high frequencies is
 
     s^2 + 1/12 - sum over k of exp(-(2 pi k s)^2) cos(2 pi k d) / (2 pi^2 k^2)   [steps^2],
 
@@ -13,9 +12,8 @@ Widrow and I. Kollar, Quantization Noise, 2008). The drift is the difference at 
 changing friction. Solving for s gives the error variance of one reading, s^2 + 1/12. It is an upper bound, since other
 differences between the passes increase it.
 
-This applies to noise that is white before rounding. Noise that a servo has filtered is stronger at low frequencies.
-This excess over the noise at high frequencies is measured from the same difference, except at frequencies that may
-contain drift (`coloured_noise`).
+This applies to noise that is white before rounding. The excess of filtered noise at low frequencies is measured from
+the same difference (`coloured_noise`).
 """
 
 from collections.abc import Sequence

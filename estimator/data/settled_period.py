@@ -89,12 +89,10 @@ class SettledPeriod:
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
         return int(self.position.shape[0])
 
     @property
     def samples(self) -> int:
-        """Number of samples in the period."""
         return int(self.position.shape[1])
 
     @property
@@ -118,8 +116,8 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
     Two distances are computed for each reading: from the median of itself and two neighbours on either side, and from a
     cubic through its neighbours. The reading is an outlier if both exceed SPIKE encoder steps and SPIKE times the
     typical distance from the median. At a low sampling rate, the median alone would mistake every fast reversal for an
-    outlier, since most readings of a steadily moving joint are the median themselves. If it does so for more than the
-    fraction MOST_SPIKES of the readings, none is marked: the joint moves fast compared with the sample rate.
+    outlier. If more than the fraction MOST_SPIKES would be marked, none is: the joint moves fast compared with the
+    sample rate.
     """
     from scipy.ndimage import median_filter
 

@@ -60,7 +60,6 @@ class Altered:
 
     @property
     def segments(self) -> int:
-        """Number of segments."""
         return len(self.problem.segments)
 
     def measured(self, number: int) -> Array:
@@ -168,7 +167,6 @@ class Altered:
         return self._parts[part]
 
     def samples(self, number: int) -> int:
-        """Number of measured angles of a segment."""
         return int(np.isfinite(self.problem.segments[number].position).sum())
 
 

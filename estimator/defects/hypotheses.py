@@ -1,8 +1,7 @@
 """Possible defects of recordings, described by additional unknowns of a fit.
 
-A defect either scales the measured angles or changes the parameters. In the latter case, each parameter changes by a
-fixed amount per unit of an unknown. The change may vary with time (friction that falls during warm-up, a load that is
-picked up), but is constant within a segment.
+A defect either scales the measured angles or changes the parameters. The change may vary with time (friction that falls
+during warm-up, a load that is picked up), but is constant within a segment.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -62,7 +61,6 @@ class Hypothesis:
 
     @property
     def unknowns(self) -> int:
-        """Number of unknowns."""
         return len(self.joints) if self.kind == "scale" else len(self.directions)
 
 

@@ -1,10 +1,9 @@
 """Search for the most probable defect of recordings: score tests of many, then fits of the best few.
 
-A correct model leaves residuals that do not depend on when they were recorded. If friction, load or torque changed, or
-angles have a wrong scale, additional unknowns explain part of the residual: one simulation with all derivatives gives
-the decrease of the sum of squares for each of them (a score test, as in `hil.estimator.selection.candidates`; for
-changes in time, following Nyblom, J. American Statistical Association 84 (1989) 223). Those that explain the most are
-fitted.
+If friction, load or torque changed, or angles have a wrong scale, additional unknowns explain part of the residual. One
+simulation with all derivatives gives the decrease of the sum of squares for each of them (a score test, as in
+`hil.estimator.selection.candidates`; for changes in time, following Nyblom, J. American Statistical Association 84
+(1989) 223).
 """
 
 from collections.abc import Sequence
@@ -91,7 +90,6 @@ def _searched(altered: Altered, every: Sequence[Hypothesis]) -> Defect | None:
 
 
 def _is_same(hypothesis: Hypothesis, other: Hypothesis, course: Course) -> bool:
-    """Return whether `hypothesis` and `other` are the same sudden change, except that `other` has this `course`."""
     return (
         hypothesis.course.kind == "step"
         and other.course == course

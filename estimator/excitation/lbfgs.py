@@ -1,8 +1,7 @@
 """Smooth minimisation by limited-memory BFGS (Nocedal and Wright, Numerical Optimization, 2nd ed., algorithm 7.5).
 
-It is implemented here because a seed must give the same phases on every machine. Library implementations use a BLAS
-whose order of summation depends on the processor, and after a few hundred evaluations the torque differs by up to 4e-4
-of its peak (docs/dependencies.md).
+It is implemented here because a seed must give the same phases on every machine. With a library's BLAS, the torque
+differs by up to 4e-4 of its peak (docs/dependencies.md).
 """
 
 from collections import deque
@@ -26,8 +25,8 @@ _sum: Callable[[Array], Any] = np.add.reduce  # np.sum takes three times as long
 def descend(function: Function, x: Array, steps: int) -> Array:
     """Minimise `function`, which returns value and gradient, in at most `steps` steps from `x`; return the last `x`.
 
-    Steps are rounded to a grid. Otherwise the last bit of a cosine, which depends on the processor, would make a
-    difference that grows from step to step, until another minimum is found.
+    Steps are rounded to a grid. Otherwise the last bit of a cosine, which depends on the processor, might lead to
+    another minimum.
     """
     value, gradient = function(x)
     pairs: Pairs = deque(maxlen=MEMORY)

@@ -1,11 +1,9 @@
 """Optimal excitation: amplitudes and phases that minimise the largest relative standard error, within limits.
 
-The standard errors are those of the likelihood (`hil.estimator.fit.stage2`) on one settled period: the inverse
-information of the positions, with unknown initial state. They are computed for a preliminary model of the arm, such as
-that of a pilot experiment. The search is a (1+1) evolution strategy with step-size control by Rechenberg's success
-rule: first over the shape of the amplitude spectra and the extent of each joint's motion, then over the phases as well.
-Every candidate is scaled to the limits. Source of the criterion: Pronzato and Pazman, "Design of experiments in
-nonlinear models", 2013, chapter 5 (E and minimax criteria).
+The standard errors are those of the likelihood (`hil.estimator.fit.stage2`) on one settled period. The search is a
+(1+1) evolution strategy with step-size control by Rechenberg's success rule: first over the shape of the amplitude
+spectra and the extent of each joint's motion, then over the phases as well. Source of the criterion: Pronzato and
+Pazman, "Design of experiments in nonlinear models", 2013, chapter 5 (E and minimax criteria).
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -53,9 +51,7 @@ class Design:
 
 
 def smoothed(physics: Physics) -> Physics:
-    """Return the arm with friction steps at least LEAST_WIDTH wide, which is faster to simulate and has nearly the same
-    optimal excitation.
-    """
+    """Return the arm with friction steps at least LEAST_WIDTH wide, which is faster to simulate."""
     vector = physics.vector.copy()
     for joint in (1, 2):
         index = CONSTANTS.index(f"coulomb_width_{joint}")

@@ -1,9 +1,8 @@
 """The step that minimises a convex quadratic function within bounds: a primal active-set method.
 
 The alternative, clipping the unconstrained step and solving again for the coordinates that remain free, would hold some
-coordinates at bounds that are inactive at the constrained minimum. In a narrow valley such a step can even lead uphill,
-and an iteration that stops where no decrease is predicted then ends far from the minimum (Nocedal and Wright, Numerical
-Optimization, section 16.5).
+coordinates at bounds that are inactive at the constrained minimum. In a narrow valley such a step can even lead uphill
+(Nocedal and Wright, Numerical Optimization, section 16.5).
 """
 
 import numpy as np

@@ -2,9 +2,8 @@
 
 N = J'WJ is the information, S the scatter of the score J'Wr. For independent errors S = N. Rounding errors of a slow
 joint, and model errors, are correlated between samples. S takes this into account if the products of the score are
-summed over lags (Newey and West, Econometrica 55 (1987) 703). With Bartlett's kernel and L lags, this equals the
-sum, over all windows of L samples, of the outer product of the window's score with itself, divided by L. It takes one
-pass for any L.
+summed over lags (Newey and West, Econometrica 55 (1987) 703). With Bartlett's kernel and L lags, this equals the sum,
+over all windows of L samples, of the outer product of the window's score with itself, divided by L.
 
 A model error is not only correlated: it repeats at every reversal, so averaging does not remove it, and the part that
 resembles the effect of a parameter leaves no residual at all. Therefore the non-white part of the residual widens the
@@ -74,9 +73,8 @@ def correlation_time(residuals: Sequence[Array], options: CovarianceOptions = DE
 def structured_share(residual: Array) -> Array:
     """Return the fraction (joints,) of the power of each residual (joints, samples) that is not white.
 
-    White noise has the same power in every Fourier line; its level is estimated from the upper half of the lines, far
-    above the frequencies of the motion. The fraction is 0 if the residual does not differ significantly from white
-    noise.
+    The level of white noise is estimated from the upper half of the Fourier lines, far above the frequencies of the
+    motion. The fraction is 0 if the residual does not differ significantly from white noise.
     """
     samples = residual.shape[1]
     power = np.abs(np.fft.rfft(residual, axis=1)) ** 2 / samples**2
@@ -138,8 +136,7 @@ def robust_covariance(
 def is_unpredictable(at: Quadratic, samples: int) -> bool:
     """Return whether the motion is so sensitive that its derivatives are valid only for extremely small changes.
 
-    Coordinates are of order 1. If a change of 1e-6 alters a sample by ten times the noise, the simulation diverges; its
-    standard errors would be tiny and meaningless.
+    The standard errors would then be tiny and meaningless. Coordinates are of order 1.
     """
     return bool(np.max(np.diag(at.normal), initial=0.0) > (samples * SENSITIVE**2))
 
@@ -183,9 +180,8 @@ def _measured(
 def _inverse(information: Array) -> Array:
     """Return the inverse of a matrix with diagonal elements of at most 1.
 
-    Coordinates that only matter together, such as constant friction and a term that varies only beyond the speeds of
-    the motion, leave an eigenvalue that is zero except for rounding. A pseudoinverse would treat their unknown
-    difference as known exactly.
+    Coordinates that only matter together leave an eigenvalue that is zero except for rounding. A pseudoinverse would
+    treat their unknown difference as known exactly.
     """
     size, directions = linalg.eigh(information)
     inverse: Array = (directions / np.maximum(size, LEAST_INFORMATION)) @ directions.T

@@ -7,8 +7,7 @@ The segments are not joined, since effects that a rigid arm does not have, such 
 state between them.
 
 Short segments are fitted first, since they converge even from a poor initial guess. Longer segments then refine the
-result, first with coarse integration steps. A segment whose
-residual is larger than usual is downweighted accordingly. `Term.spread` serves as a prior.
+result, first with coarse integration steps. `Term.spread` serves as a prior.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,8 +1,8 @@
 """Minimisation of the likelihood from several initial guesses, with coarse integration steps first.
 
-Most iterations use coarse integration steps; fine steps decide between minima that coarse ones cannot separate. The
-noise level of each joint is itself estimated before the final iterations, in which outliers are downweighted (Huber),
-so that a few corrupted readings do no harm.
+Fine steps then decide between minima that coarse ones cannot separate. The noise level of each joint is itself
+estimated before the final iterations, in which outliers are downweighted (Huber), so that a few corrupted readings do
+no harm.
 """
 
 from collections.abc import Callable, Sequence
@@ -156,9 +156,9 @@ class Search:
     def _refine(self, starts: Sequence[Start], wide: Array) -> Refined:
         """Refine the best of `starts`, and variants with different friction near standstill, using fine steps.
 
-        A fit that explains the motion may still have the wrong friction there, with a slightly larger sum of squares.
-        The tracking fit determines that friction well, and fits do not get from a narrow step to a wide one, so the
-        friction of the tracking fit and that of `wide` (coordinates) are both tried.
+        A fit that explains the motion may still have the wrong friction there. The tracking fit determines it well, and
+        fits do not get from a narrow step to a wide one, so the friction of the tracking fit and that of `wide`
+        (coordinates) are both tried.
         """
         options = self.options
         ftol = options.ftol_coarse if self.coarse else options.ftol_start

@@ -47,7 +47,6 @@ class Objective:
 
     @property
     def count(self) -> int:
-        """Number of parameters."""
         return len(self.coordinates.names)
 
     def physics(self, x: Array) -> Physics:
@@ -88,7 +87,6 @@ class Objective:
         return total
 
     def _expected(self, x: Array) -> Quadratic:
-        """Return the contribution of the priors."""
         normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
         normal[: self.count, : self.count] = np.diag(self.prior.precision)
         gradient[: self.count] = self.prior.precision * (x[: self.count] - self.prior.centre)

@@ -2,9 +2,8 @@
 
 The range, scale and longest step of each parameter are declared in `hil.estimator.models.terms`. Positive parameters
 are exponentials of their coordinates. Coupling is a fraction of its bound: sqrt(inertia_1 inertia_2) tanh(z), where z
-is its coordinate. This bound holds for every arm with positive masses and keeps the mass matrix positive definite.
-Likewise, the asymmetry of viscous friction is viscous tanh(z), which keeps friction positive in both directions. The
-width of the smoothed Coulomb step stays above a floor.
+is its coordinate. This keeps the mass matrix positive definite. Likewise, the asymmetry of viscous friction is viscous
+tanh(z), which keeps friction positive in both directions.
 """
 
 from dataclasses import dataclass
@@ -65,8 +64,7 @@ class Coordinates:
         """Return the point that `step` (coordinates,) reaches from `x`; both arrays may end with other coordinates.
 
         A step changes a width itself rather than its logarithm, since the motion depends linearly on the width. With
-        exponential steps the width would never reach its floor, and the parameters that compensate for it would
-        overshoot.
+        exponential steps it would never reach its floor.
         """
         y = x + step
         widths = np.flatnonzero(self._floors)
@@ -93,8 +91,8 @@ class Coordinates:
     def limit(self, x: Array, least: Array, most: Array, max_relative_decrease: float) -> None:
         """Tighten, in place, the bounds on the change of each coordinate in one step from `x` (coordinates,).
 
-        A width is limited relative to itself, other parameters by their `Term.max_step`. If a width shrank to its floor
-        in a single step, the motion would no longer depend on it, and no later step would increase it again.
+        A width is limited relative to itself, other parameters by their `Term.max_step`. From its floor, on which the
+        motion hardly depends, no later step would increase it again.
         """
         least[: x.size] = np.maximum(least[: x.size], -self._longest)
         most[: x.size] = np.minimum(most[: x.size], self._longest)

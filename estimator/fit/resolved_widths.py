@@ -1,8 +1,7 @@
 """The narrowest smoothed Coulomb step that a simulation resolves.
 
-On a light arm, friction stops a joint within microseconds. A step narrower than the bound returned here looks no
-different in any recording, but the simulation jumps back and forth across it, which makes the derivatives, and hence
-the standard errors, meaningless.
+On a light arm, friction stops a joint within microseconds. A narrower step looks no different in any recording, but the
+simulation jumps back and forth across it, which makes the derivatives meaningless.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,8 +1,8 @@
 """Period of torque ripple and cogging over the joint angle: a scan that needs no initial guess.
 
 For each number of cycles per turn, torque times the sine and cosine of the angle are two additional columns of the
-regression on Fourier lines; for cogging, the columns are the sine and cosine themselves. The number that explains the
-most of the residual of dynamics and friction is the likelihood's initial guess.
+regression on Fourier lines; for cogging, the columns are the sine and cosine themselves. The best number is the
+likelihood's initial guess.
 """
 
 from collections.abc import Sequence

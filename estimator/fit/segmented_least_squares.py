@@ -1,8 +1,7 @@
 """Nonlinear least squares with some unknowns shared by all segments and others specific to each segment.
 
 A segment's own unknowns only affect its own residuals, so the normal equations have an arrowhead structure: each
-segment's block is eliminated separately (Schur complement), and the corresponding columns of the Jacobian are computed
-for all segments at once.
+segment's block is eliminated separately (Schur complement).
 """
 
 from collections.abc import Callable, Sequence
@@ -82,7 +81,7 @@ class Segmented:
         for white noise. The covariance is infinite for coordinates that can change, alone or together, without
         affecting the residual.
 
-        Scores at the minimum are smaller than at the true values, so no variance is less than for white residuals.
+        No variance is less than for white residuals.
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.

@@ -4,11 +4,10 @@ springs.
 A stabiliser with stiffness k applied the torque k (pose - measured). In closed loop, the simulated arm would receive k
 (pose - simulated) instead, which equals the commanded torque plus that of a spring, k (measured - simulated). The
 simulation therefore uses the commanded torque and this spring instead of the loop. An arm that is unstable on its own
-then stays close to the real one, and if model and arm agree, the spring has no effect. The stabiliser's damper is left
-out: it only determines how fast deviations decay.
+then stays close to the real one. The damper, which only determines how fast deviations decay, is left out.
 
 The springs pull the simulated joints to where the real ones were. Therefore any encoder errors in the model are removed
-from the measured angles; otherwise a spring would exert a torque that never acted on the arm.
+from the measured angles.
 """
 
 from collections.abc import Iterator

@@ -2,7 +2,7 @@
 
 If position errors are independent and identically distributed, as rounding errors nearly are, the most likely
 parameters minimise the weighted sum of squares. The initial state of each run is estimated as well: simulating until
-the motion is periodic would take two or more periods instead of one. `hil.estimator.fit.multistart` finds the minimum.
+the motion is periodic would take two or more periods instead of one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -315,9 +315,8 @@ def _tempered(
     """Return the minimum with priors reweighted by the data's actual information; `minimum` if nothing changes.
 
     The sum of squares treats the errors of all samples as independent. A model error repeats at every reversal, so the
-    data constrain a parameter far less than this implies, as the parameter's standard error shows. The fit would
-    override any prior and yield, for example, a torque constant of half the smallest plausible value. Therefore each
-    prior's precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
+    data constrain a parameter far less than this implies, and the fit would override any prior. Therefore each prior's
+    precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
     """
     count, prior = objective.count, objective.prior
     if objective.lever is None and not prior.precision.any():

@@ -1,10 +1,9 @@
 """Parameters at a bound of their range, although the data favour values beyond it.
 
-A fit cannot leave the physical range: an inertia stays positive, a coupling below the geometric mean of its inertias.
-If the model is wrong or the recording carries little information, the best value may lie outside. The fit then stops
-at the bound, which the standard errors do not reflect, and the other parameters absorb the difference. A parameter
-whose true value is zero, such as the Stribeck term of a joint without Stribeck friction, also ends there but does no
-harm: the undamped step of the normal equations, in the parameters themselves, distinguishes the two cases.
+A fit cannot leave the physical range. If the best value lies outside, the fit stops at the bound, which the standard
+errors do not reflect, and the other parameters absorb the difference. A parameter whose true value is zero, such as the
+Stribeck term of a joint without Stribeck friction, also ends there but does no harm: the undamped step of the normal
+equations, in the parameters themselves, distinguishes the two cases.
 """
 
 from collections.abc import Sequence

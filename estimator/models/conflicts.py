@@ -1,7 +1,7 @@
 """Values that contradict prior knowledge by being many standard deviations from configured or typical values.
 
-If the model lacks an effect, such as gear backlash, other parameters of the fit imitate it. The true values of some are
-known beforehand; a large deviation then reveals the imitation, which standard errors do not.
+If the model lacks an effect, such as gear backlash, other parameters imitate it. A large deviation from a value known
+beforehand reveals this; standard errors do not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -126,8 +126,8 @@ def worst_first(found: Sequence[Conflict | None]) -> tuple[Conflict, ...]:
 def contradicted(found: Sequence[Conflict], explained: bool) -> str:
     """Return the best verdict that the contradictions allow: "no", "with care", or "" if they allow any verdict.
 
-    explained: whether the model explains the motion. If it does not, and a known value is far off, an effect missing
-    from the model has distorted that value, and presumably all others as well.
+    explained: whether the model explains the motion. If it does not, a missing effect has distorted the value, and
+    presumably all others as well.
     """
     of_file = [each for each in found if each.source == "file"]
     if of_file:

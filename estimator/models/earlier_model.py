@@ -1,11 +1,10 @@
 """Comparison of the mean torque over the last few tenths of a second with the model from before that time.
 
-A push or grip that begins while the model is still being learnt distorts it: sample by sample, parameters and noise
-follow the disturbance, and no residual stands out. The model from before the disturbance does not follow it. Its
-prediction for all samples since then is therefore compared with the mean torque over that time: over the last 5, 10 and
-20 lessons (updates of the model), which last 0.1, 0.2 and 0.4 s. In the mean, effects that alternate with the motion
-(noise, play, ripple) cancel, but a push does not. If the joint has hardly moved in that time, friction may have held it
-back: a gear yields elastically before it slides.
+A push or grip that begins while the model is still being learnt distorts it, so that no residual stands out. The
+earlier model does not follow it. Its prediction for all samples since then is therefore compared with the mean torque
+over that time: over the last 5, 10 and 20 lessons (updates of the model), which last 0.1, 0.2 and 0.4 s. In the mean,
+effects that alternate with the motion (noise, play, ripple) cancel, but a push does not. If the joint has hardly moved
+in that time, friction may have held it back.
 
 The terms of a joint's equation, `torque - row theta`, are summed over time, so that the mean between any two stored
 moments requires one subtraction. These functions are part of compiled loops.

@@ -96,7 +96,6 @@ class Model:
 
     @property
     def base_names(self) -> tuple[str, ...]:
-        """Names of the base parameters."""
         return base_names(self.joints)
 
     @property
@@ -116,5 +115,4 @@ class Model:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of `names`."""
         return units_of(self.names)

@@ -1,8 +1,8 @@
 """Masses, centres of mass and inertias from base parameters and other known quantities of the arm.
 
 Torque and position determine six combinations of ten quantities (for one joint, two combinations of four). Each known
-length, mass or rotor inertia reduces the unknowns by one. What remains undetermined is the null space of the equations:
-a quantity without a component in it is determined; the others form groups of inseparable quantities.
+length, mass or rotor inertia reduces the unknowns by one. A quantity without a component in the null space of the
+equations is determined; the others form inseparable groups.
 """
 
 from collections.abc import Mapping

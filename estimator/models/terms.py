@@ -2,8 +2,8 @@
 
 Fits, results, reports, exports and the configuration take names, units, descriptions, ranges, initial guesses and
 scales from here; docs/architecture.md lists the files that a new term touches. Parameters are named `term_joint`, with
-joints counted from 1, and terms of the whole arm just `term`. This module only imports the standard library, so that
-reading a result imports no large packages.
+joints counted from 1, and terms of the whole arm just `term`. It imports only the standard library, so that reading a
+result is fast.
 """
 
 import re
@@ -111,8 +111,8 @@ class Term:
     fastest: float | None = None
     """Upper bound of a term that is a speed, as a multiple of the joint's highest speed; None for no bound.
 
-    A term that hardly changes over the speeds of the motion is equivalent to another term: a Stribeck rise that never
-    falls is Coulomb friction, and a Coulomb step that is never completed is viscous friction.
+    A Stribeck rise that never falls is Coulomb friction, and a Coulomb step that is never completed is viscous
+    friction.
     """
     max_step: float | None = None
     """Maximum change of the term's coordinate (for positive terms, a logarithm) per iteration; None for the fit's
@@ -382,7 +382,6 @@ def constants() -> tuple[str, ...]:
 
 
 def units_of(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the units of parameters."""
     return tuple(term_of(name).unit for name in names)
 
 

@@ -1,11 +1,11 @@
 """Missing model terms, judged without fitting them: score tests, and the effect of omission on standard errors.
 
-Near an estimate the motion is linear in small changes of any parameter, including the parameters of terms that the
-model lacks. One simulation with derivatives with respect to all of them yields the decrease of the sum of squares that
-each term would bring (C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the
-fitted parameters. Terms that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the
-standard errors even if the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control
-Systems 3 (1966) 293), with their typical size as the prior.
+Near an estimate the motion is linear in small changes of any parameter. One simulation with derivatives with respect to
+all of them yields the decrease of the sum of squares that each term would bring (C. R. Rao's score test, Proc.
+Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the fitted parameters. Terms that cannot be ruled out,
+such as an encoder's zero or torque saturation, therefore widen the standard errors even if the motion does not reveal
+them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3 (1966) 293), with their typical size as the
+prior.
 """
 
 from collections.abc import Mapping, Sequence
@@ -196,8 +196,7 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
     """Return the estimate's covariance (parameters, parameters) [SI], including the effect of omitted terms that cannot
     be ruled out.
 
-    Each of their parameters is described by its prior and the information from the motion, as if it were fitted as
-    well. Since it is not, the change that fitting it would cause also counts as an error.
+    The change that fitting them, with their prior, would cause also counts as an error.
     """
     left_out = unruled(estimate.model)
     if not left_out:

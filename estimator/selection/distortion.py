@@ -3,16 +3,14 @@
 The method is that of Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. An arm that is excited
 only on odd lines responds on these and, being nonlinear, on others as well. Effects that change sign with the motion
 (friction, gravity about a hanging pose) produce odd lines; others (an offset, direction-dependent friction, any other
-pose) produce even lines. Some odd lines, the detection lines, are left unexcited to observe the effects of the first
-kind. If even lines are excited too, odd distortion appears on all lines, so the unexcited lines cannot be separated
-into odd and even and form a single group. The residual of a fit on each group, beyond the noise, is the model error of
-that group.
+pose) produce even lines. Some odd lines, the detection lines, are left unexcited. If even lines are excited too, odd
+distortion appears on all lines, so the unexcited lines cannot be separated into odd and even and form a single group.
+The residual of a fit on each group, beyond the noise, is the model error of that group.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.fourier import Lines, cut_off, lines_of, noise_power
@@ -87,6 +85,6 @@ def distortion(period: SettledPeriod, estimate: Estimate) -> Distortion:
     )
 
 
-def _rms(lines: Lines, chosen: npt.NDArray[np.bool_]) -> Array:
+def _rms(lines: Lines, chosen: Mask) -> Array:
     rms: Array = np.sqrt(2.0 * np.mean(np.abs(lines[:, chosen]) ** 2, axis=1))
     return rms

@@ -2,8 +2,8 @@
 
 A fit of one period, or of the mean of several, is valid for the middle of their time span. Other periods then show
 whether friction was larger or smaller: the difference in motion is nearly linear in one factor per joint, for viscous
-and dry friction, and in the period's initial state. The difference may also be due to a constant torque that acts in
-only one of the periods; the cause that explains more is reported.
+and dry friction, and in the period's initial state. A constant torque in only one of the periods is the alternative
+cause.
 """
 
 from collections.abc import Sequence
@@ -70,9 +70,8 @@ def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
     during `period`.
 
     The fit assumes constant friction. If friction changes at the rate of `drift`, other parameters absorb part of this
-    slow change of torque. This mainly concerns parameters whose torque also varies slowly, such as the gravity terms
-    of an arm on which gravity acts only weakly. The motion is assumed to follow the instantaneous friction, which holds
-    if transients decay within a small part of the period.
+    slow change of torque. The motion is assumed to follow the instantaneous friction, which holds if transients decay
+    within a small part of the period.
     """
     about = linearised(period, estimate, (), {})
     derivative = by_parameters(period, estimate)

@@ -15,10 +15,9 @@ from hil.estimator.simulation.encoder import measured, without_errors
 def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
     """Predict the positions (joints, samples) [rad] of another settled period from `estimate`.
 
-    The simulation starts one period earlier, from the state measured there, and then uses only the torque. This is
-    necessary because a motion that counts as settled may still contain the end of a transient, which depends on where
-    friction previously held the arm. If that state is not known, the arm is simulated from rest until its motion
-    repeats.
+    The simulation starts one period earlier, from the state measured there, and then uses only the torque. A motion
+    that counts as settled may still contain the end of a transient. If that state is not known, the arm is simulated
+    from rest until its motion repeats.
 
     Raises PeriodicityError if that motion never repeats.
     """

@@ -1,8 +1,7 @@
 """Other initial guesses for an estimate that may be at a local minimum.
 
 The likelihood has several minima if a term acts in a narrow range: the width of the Coulomb step, the stiffness of
-bristles (if they are too stiff to bend, the data do not reveal their stiffness), and the periods of torque ripple and
-cogging.
+bristles, and the periods of torque ripple and cogging.
 """
 
 from collections.abc import Iterator, Mapping
@@ -51,8 +50,8 @@ def restarts(period: SettledPeriod, estimate: Estimate, options: SelectionOption
 def undisguised(estimate: Estimate) -> dict[str, float]:
     """Return changed parameters, by name, for joints whose Stribeck rise may really be a narrow Coulomb step.
 
-    A rise that fades within a wide step resembles a narrow step without a rise, and explains the motion almost equally
-    well. A fit started from one does not reach the other.
+    A rise that fades within a wide step resembles a narrow step without a rise, but a fit started from one does not
+    reach the other.
     """
     values: dict[str, float] = estimate.parameters
     changed: dict[str, float] = {}

@@ -1,9 +1,9 @@
 """Friction model selection: models are fitted from simple to rich and judged on a held-out motion.
 
-A richer model always has a smaller residual on the motion to which it was fitted. Its open-loop prediction of another
-motion improves only if its terms are real, or by chance. Therefore it must also reduce the residual by more than
-meaningless terms would. Without another motion, the Bayesian information criterion is used (Schwarz, Annals of
-Statistics 6 (1978) 461), with the number of samples reduced according to the residual's correlation.
+A richer model's open-loop prediction of another motion improves only if its terms are real, or by chance. Therefore it
+must also reduce the residual by more than meaningless terms would. Without another motion, the Bayesian information
+criterion is used (Schwarz, Annals of Statistics 6 (1978) 461), with the number of samples reduced according to the
+residual's correlation.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -49,11 +49,11 @@ def choose(
     First, Stribeck friction is fitted together with the encoders' zeros and the ratio of two torque constants, which
     are never known exactly. If that does not explain the motion, or if a score test finds a significant term in the
     residual (`hil.estimator.selection.candidates`), all other smooth terms are added at once: load, direction,
-    saturation, cables, encoder nonlinearity. Adding them one by one would be misleading, since each would absorb the
-    effects of the missing ones; together, with typical sizes as a prior, they can be separated. Then presliding
-    friction and torque ripple are tried, and finally insignificant terms are removed. A model that predicts `held_out`
-    worse than a simpler one is not chosen. If friction differs between the two recordings, it also changed within each;
-    this is corrected (`hil.estimator.selection.steadied`).
+    saturation, cables, encoder nonlinearity. One by one, each would absorb the effects of the missing ones; together,
+    with typical sizes as a prior, they can be separated. Then presliding friction and torque ripple are tried, and
+    finally insignificant terms are removed. A model that predicts `held_out` worse than a simpler one is not chosen. If
+    friction differs between the two recordings, it also changed within each; this is corrected
+    (`hil.estimator.selection.steadied`).
 
     Args:
         periods: settled periods of one arm to be fitted; the first is used to find missing terms.
@@ -240,9 +240,8 @@ class Selection:
     def _with_wave(self, best: Trial, plain: Trial | None = None) -> Trial:
         """Add ripple or cogging, whichever explains more, if the score test finds it.
 
-        The score test needs the model that explains the most, `best`. A fit that starts from it may end far from the
-        truth, because cables, saturation and load have so far imitated the wave together. Therefore the wave is first
-        added to `plain`, which has few terms that could imitate it, and then the other terms are added.
+        The score test needs the model that explains the most, `best`. In that model, other terms imitate the wave.
+        Therefore the wave is first added to `plain`, which has few such terms, and then the other terms are added.
         """
         assert best.estimate is not None
         absent = [wave for wave in WAVES if wave not in best.model.options]
@@ -303,7 +302,6 @@ class Selection:
         return best
 
     def _better(self, richer: Trial | None, plainer: Trial | None) -> Trial | None:
-        """Return `richer` if its terms reduce the residual sufficiently, otherwise `plainer`."""
         if richer is None or plainer is None:
             return richer or plainer
         if richer.model == plainer.model:
@@ -387,7 +385,6 @@ class Selection:
         *,
         coarse: bool = False,
     ) -> Trial | None:
-        """Return a trial; None if the fit does not converge."""
         try:
             return self._try(model, near, values, coarse=coarse)
         except ConvergenceError:

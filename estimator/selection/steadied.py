@@ -1,9 +1,9 @@
 """Correction of periods for friction that changes while they are recorded, such as while grease warms up.
 
 A fit assumes constant friction. If friction changes by a fraction c per second, the fit lacks the torque c (t -
-t_middle) F(t), where F is the friction torque. F is known well from the measured motion and a first fit, and c from a
-later recording (`hil.estimator.selection.drift`), so that the product, a small part of the friction, can be subtracted
-from the commanded torque. The fit then holds for the middle of the period.
+t_middle) F(t), where F is the friction torque. F follows from the measured motion and a first fit, and c from a later
+recording (`hil.estimator.selection.drift`); the product is subtracted from the commanded torque. The fit then holds for
+the middle of the period.
 """
 
 from dataclasses import replace

@@ -6,7 +6,7 @@ with their typical sizes as a prior; then insignificant terms are removed.
 
 If the motion is explained down to the noise, the likelihood decides. Otherwise a richer model may merely compensate for
 another missing term. Then every other segment of each recording is fitted and the rest are predicted, also by models
-with presliding friction. The best predictor is fitted once more to all segments.
+with presliding friction.
 """
 
 import time
@@ -142,7 +142,6 @@ class _Search:
         of: slice = ALL,
         options: ShootingOptions = FINE,
     ) -> ShootingEstimate | None:
-        """Return an estimate; None if the fit does not converge."""
         try:
             return estimate_by_shooting(
                 self._recordings,
@@ -160,8 +159,7 @@ class _Search:
     def trial(self, near: ShootingEstimate, model: Model) -> SegmentTrial:
         """Fit `model`, starting from `near`, and return how well it predicts segments that were held out of the fit.
 
-        `near` was also fitted to the held-out segments, but it only determines which local minimum is found, not its
-        location.
+        `near` only determines which local minimum is found.
         """
         if model not in self._trials:
             began = time.perf_counter()
@@ -210,7 +208,6 @@ class _Search:
         return bool(found) and found[0].evidence > 1.0
 
     def _pruned(self, best: ShootingEstimate) -> ShootingEstimate:
-        """Return the final fit without insignificant terms."""
         for level in self._options.prune_levels:
             model = pruned_model(best.model, best.names, best.value, best.covariance, level, self._fixed)
             if model == best.model:

@@ -30,9 +30,8 @@ def wave_peaks(
     numbers, best first.
 
     Whatever the fitted parameters can explain is removed from residual and waves first. The result is keyed by
-    parameter name. If the estimate's model includes a wave that is searched for, that wave is disabled first. If other
-    terms have absorbed part of a wave, the best number may be wrong. Therefore other numbers are returned as well if
-    they explain at least `COMPARABLE` times as much of the sum of squares as the best one.
+    parameter name. If other terms have absorbed part of a wave, the best number may be wrong. Therefore other numbers
+    are returned as well if they explain at least `COMPARABLE` times as much of the sum of squares as the best one.
 
     only: joints to consider, from 1; by default all.
     """

@@ -105,8 +105,7 @@ def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> NDA
 
     Within one substep, a reversal of dry friction may take a joint through a quarter of its Coulomb step's width. The
     numbers are powers of two, so that small changes of the physics seldom change them and hence the last digits of the
-    motion. They differ between joints, since the velocity of a joint with a wide step is nearly always within that
-    width.
+    motion.
     """
     needed = [min(4.0 * step / max(time, 1e-12), most) for time in physics.crossing_times()]
     return np.array([2 ** math.ceil(math.log2(max(each, 1.0))) for each in needed], dtype=np.int64)

@@ -9,10 +9,9 @@ Astrom and P. Lischinsky, "A new model for control of systems with friction", IE
 A step of the arm is split (Strang, SIAM Journal on Numerical Analysis 5 (1968) 506). In the first half, the bristles
 deflect at the step's initial velocity, which is solved exactly; then the arm moves with their torque as an additional
 offset and their damping as additional viscous friction; in the second half, they deflect at the final velocity. The
-arm's own step is the same as for every other friction law. The level is evaluated at the mid-step velocity, which for
-the first half is predicted from the last step's acceleration. Once the bristles slip, friction equals the level, which
-would otherwise be half a step late. Compared with a hundred steps per sample, three at 400 Hz are accurate to 0.03
-encoder steps RMS for 5 to 1000 N m/rad.
+level is evaluated at the mid-step velocity, which for the first half is predicted from the last step's acceleration.
+Otherwise the level would be half a step late. Compared with a hundred steps per sample, three at 400 Hz are accurate to
+0.03 encoder steps RMS for 5 to 1000 N m/rad.
 """
 
 import math

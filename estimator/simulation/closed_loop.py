@@ -2,8 +2,7 @@
 
 The equations, including the torque scale, and the default integration step are those of `hil.estimator.simulation.arm`.
 A command is computed once per sample from the state at the previous sample, as on the real bus, then limited and held;
-the motor follows it with a first-order lag. A pure delay of the drive is added to that lag; to first order, the two are
-equivalent.
+the motor follows it with a first-order lag. A pure delay of the drive is added to that lag.
 """
 
 import math
@@ -66,8 +65,8 @@ class Response:
 class Stabilised:
     """A period in which `feedback` applied part of the torque.
 
-    In the simulation, the feedback acts on the simulated arm, as it did on the real one, so an arm that is unstable on
-    its own can be simulated. If model and arm agree, the torque equals the one actually commanded.
+    The feedback acts on the simulated arm, so an arm that is unstable on its own can be simulated. If model and arm
+    agree, the torque equals the one actually commanded.
     """
 
     feedback: Feedback

@@ -10,9 +10,8 @@ A parameter only enters through the residuals of W k = f, of M' a = f' and of th
 e changes the new velocity by A r + B g + C e, where A, B and C are two-by-two matrices common to all parameters.
 Therefore each further parameter costs a few dozen operations per step instead of another simulation.
 
-A processor handles several parameters at once if the compiler knows that rows of derivatives do not overlap, so they
-are WIDE apart in one-dimensional arrays. Rows are processed one step behind the rest, since reading several values at a
-time stalls if they have just been written one by one.
+For vector instructions, rows of derivatives are WIDE apart in one-dimensional arrays, and are processed one step behind
+the rest, since reading several values at a time stalls if they have just been written one by one.
 """
 
 import math

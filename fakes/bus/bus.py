@@ -3,8 +3,8 @@
 Bytes take wire time (ten bits each). A packet takes effect when its last byte arrives: the plant is advanced to that
 moment with the previous motor currents, then the addressed servos act. Replies start after the servo's return delay and
 reach the host `adapter_latency_us` later. When the host writes, everything up to the last packet of that write is
-computed, even if it lies ahead of the clock. Between two packets, only Bus Watchdogs, the servos' own loops and faults
-can act; the plant's advance is split at the times when they do.
+computed, even if it lies ahead of the clock. The plant's advance is split where Bus Watchdogs, the servos' own loops
+and faults act between two packets.
 
 When host and servo, or two servos with different IDs, transmit at once, the later packet and the rest of the earlier
 one are lost. Which servos act and reply is decided in `hil.fakes.bus.instructions`.
@@ -158,8 +158,7 @@ class FakeBus:
     def read(self, size: int, timeout_s: float) -> bytes:
         """Return up to `size` bytes, waiting on the clock for at most `timeout_s` (0: only what has already arrived).
 
-        New bytes only appear when the host writes, so an infinite wait (`math.inf`) ends when all bytes in transit have
-        arrived. The wait also ends when the cable is unplugged.
+        An infinite wait (`math.inf`) ends when all bytes in transit have arrived, or when the cable is unplugged.
         """
         now = self.clock.now()
         deadline = now + timeout_s
@@ -277,7 +276,6 @@ class FakeBus:
         self._ticks_wanted()
 
     def _ticks_wanted(self) -> None:
-        """Start or stop ticking, depending on whether supply, hand or servos need it."""
         if self._supply is None and not self._hand.busy and not any(servo.needs_ticks for servo in self._servos):
             self._next_tick = math.inf
         elif self._next_tick == math.inf:
@@ -338,10 +336,6 @@ class FakeBus:
                 servo.connected = True
 
     def send(self, replies: Sequence[Reply], now: float) -> None:
-        """Put replies on the wire.
-
-        Each starts after its delay from the end of the previous one; the first delay counts from `now`.
-        """
         wire, faults = self._wire, self.faults
         if faults.on_replies:
             for servo_id, delay_s, data in replies:
@@ -359,7 +353,6 @@ class FakeBus:
             wire.put(joined, now)
 
     def measure(self, servo: EmulatedServo, address: int, length: int) -> None:
-        """Update the registers in this address range with the state of the servo's joint."""
         end_address = address + length
         if (address < PRESENT_END and end_address > PRESENT_START) or servo.memory.is_indirect(address, length):
             index = self._index[servo]
@@ -367,7 +360,6 @@ class FakeBus:
             servo.present.measure(address, end_address, self._now, position[index], velocity[index], current[index])
 
     def joints(self) -> States:
-        """Return position [rad], velocity [rad/s] and motor current [A] of the joints, one value per servo."""
         if self._one_each:
             plant = self.plant
             return plant.position, plant.velocity, plant.current
@@ -379,7 +371,6 @@ class FakeBus:
 
     @property
     def servos_refuse(self) -> bool:
-        """Whether an active fault makes the servos refuse commands."""
         return bool(self.faults.on_answers)
 
     def fault_error(self, servo: EmulatedServo, now: float) -> int:

@@ -4,7 +4,7 @@
 class VirtualClock:
     """A `hil.drivers.clock.Clock` that stands still while the program computes and jumps when it waits.
 
-    A run on this clock is deterministic and takes only as long as computing the bytes sent and the plant's motion.
+    A run on this clock is deterministic.
     """
 
     def __init__(self, start: float = 0.0) -> None:

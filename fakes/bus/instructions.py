@@ -1,6 +1,6 @@
 """Which servos act on an instruction packet, which reply, and in which order.
 
-"Conformance" in docs/fake-bus.md lists the choices made where the manual is silent. In a group read, each servo waits
+For choices made where the manual is silent, see "Conformance" in docs/fake-bus.md. In a group read, each servo waits
 for the complete status of the one listed before it (source: ROBOTIS in DynamixelSDK issue 364).
 """
 
@@ -152,7 +152,6 @@ class Instructions:
         self._line.send(self._overlaid(answers), now)
 
     def _overlaid(self, answers: list[Reply]) -> list[Reply]:
-        """Return the transmissions on the line when servos with the same ID answer."""
         if len(answers) < 2:
             return answers
         baud, end, pieces = self._line.baud, 0, []
@@ -181,7 +180,6 @@ class Instructions:
         return error | fault, data
 
     def _write(self, servo: EmulatedServo, addressed: int, address: int, data: bytes, now: float) -> None:
-        """Apply one servo's part of a group write."""
         if self._line.servos_refuse and self._line.fault_error(servo, now) & ~ALERT:
             return
         (servo.write if servo.id == addressed else servo.write_as_shadow)(address, data)
@@ -291,7 +289,6 @@ class Instructions:
         return len(pieces) == 1 and pieces[0][2] == answers[0][2]
 
     def _answering(self, servo_id: int, now: float) -> list[EmulatedServo]:
-        """Return the servos that answer a group read at this ID."""
         servos = self._by_id.get(servo_id, ())
         return [servo for servo in servos if servo.heard_at == now and servo.status_return_level]
 

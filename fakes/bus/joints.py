@@ -1,8 +1,7 @@
 """Assignment of servos to joints: usually one per joint, or two if a pair drives it.
 
 Two servos on one joint share its angle; the plant receives the sum of their motor currents. Each servo measures the
-current it commands plus its share of the difference between the plant's current and the total command, which is due to
-the lag of the current loop.
+current it commands plus its share of the deviation due to the current loop's lag.
 """
 
 from collections.abc import Sequence
@@ -27,7 +26,6 @@ class Joints:
         """Whether servo i moves joint i, the usual case."""
 
     def of_joint(self, joint: int) -> list[EmulatedServo]:
-        """Return the servos that move a joint."""
         return [servo for servo, moved in zip(self._servos, self.of, strict=True) if moved == joint]
 
     def commands(self) -> list[float]:

@@ -1,8 +1,7 @@
 """Precomputed group reads of the control cycle.
 
 They read Present Current, Velocity and Position of several servos, or registers without measurements, such as goals.
-They return the same bytes as the general path in `hil.fakes.bus.instructions` in half the time; a fake bus spends most
-of its time here.
+They return the same bytes as the general path in `hil.fakes.bus.instructions` in half the time.
 """
 
 import functools
@@ -30,9 +29,7 @@ _pack_crc = Struct("<H").pack
 class JointStates(Protocol):
     """Source of the joints' states."""
 
-    def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Return position [rad], velocity [rad/s] and motor current [A] of the joints, one value per servo."""
-        ...
+    def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]: ...
 
 
 class _Part(NamedTuple):
@@ -119,7 +116,6 @@ class GroupReads:
         return told or None
 
     def _prepare(self, body: bytes, by_id: Mapping[int, Sequence[EmulatedServo]]) -> _Request:
-        """Store and return a request."""
         if len(self._prepared) >= MOST_PREPARED:
             self._prepared.clear()
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8

@@ -79,8 +79,8 @@ class Wire:
     def put(self, data: bytes, start: float, late_s: float = 0.0) -> float:
         """Transmit a servo's data from time `start`; return the time at which the transmission ends.
 
-        late_s: additional delay in the adapter [s], which also holds back what follows on the wire: an adapter hands
-        bytes over in the order in which they were received. If another reply is being transmitted, both are lost.
+        late_s: additional delay in the adapter [s], which also holds back what follows. If another reply is being
+        transmitted, both are lost.
         """
         byte_s = self.byte_s
         end = start + len(data) * byte_s

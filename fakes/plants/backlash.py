@@ -4,8 +4,7 @@ The rotor (with its inertia times the gear ratio squared) is subject to the moto
 stops. The links are attached to the output shafts, as are the servos' encoders. Within the gap, no torque is
 transmitted between the two; at its ends, the gears act as a spring and a damper that can push but not pull.
 
-The contact is stiff, so the time steps are short: such an arm takes about ten times as long to simulate as one without
-backlash, and longer if its links are very light.
+The contact is stiff: such an arm takes about ten times as long to simulate as one without backlash.
 """
 
 from collections.abc import Sequence
@@ -61,11 +60,9 @@ class GearedArm:
         return [rotor.angle for rotor in self._rotors]
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Block a joint's motor, or release it."""
         self._rotors[joint].motor.jammed = jammed
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._rotors[joint].motor.held_at = velocity
 
     def advance(self, until: float, current: Sequence[float]) -> None:

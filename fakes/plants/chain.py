@@ -58,11 +58,9 @@ class SpatialChain:
         return list(map(float, self._state[3]))
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Block a joint, or release it."""
         self._held[0, joint] = JAM if jammed else 0.0
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         # Just stiff enough to move a bare rotor within one step.
         grip = max(2.0 * self._drive[ARMATURE, joint] / self._longest, LEAST_GRIP)
         self._held[1:, joint] = (0.0, 0.0) if velocity is None else (grip, velocity)

@@ -90,7 +90,6 @@ class ChainArm(Described):
 
 
 def _loaded(body: Body, mass: float, at: np.ndarray) -> Body:
-    """Return the body with a point mass fixed to it."""
     if mass == 0.0:
         return body
     total = body.mass + mass

@@ -7,9 +7,7 @@ Kane's equations: the Jacobians Jv and Jw of each link's centre of mass yield ma
 where a and alpha are the accelerations due to the joint velocities alone. The estimator models the same arm
 independently, with spatial vectors and a regressor of base parameters; a test compares the two.
 
-Time integration is as in `hil.fakes.plants.two_link`: symmetric and second-order. Dry friction is an impulse on each
-joint, limited to its level times the step and just large enough to bring the joint to rest; a step in which a velocity
-changes sign is split there.
+Time integration and dry friction are as in `hil.fakes.plants.two_link`.
 """
 
 import math

@@ -9,8 +9,7 @@
     links = [{ length = 0.1, mass = 0.05, centre = 0.05, inertia = 1e-4 }]
     drives = [{ mass = 0.02, rotor_inertia = 8e-8, gear_ratio = 288.4, torque_constant = 0.35, viscous = 0.01 }]
 
-Each joint is described as an arm with one joint. This suffices for programs that communicate with servos and move an
-arm, but not for those that depend on coupling between joints.
+Each joint is described as an arm with one joint.
 """
 
 from collections.abc import Sequence
@@ -52,11 +51,9 @@ class Independent:
         return [joint.current[0] for joint in self._joints]
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Block a joint, or release it."""
         self._joints[joint].jam(0, jammed)
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._joints[joint].hold(0, velocity)
 
     def advance(self, until: float, current: Sequence[float]) -> None:

@@ -2,7 +2,7 @@
 plain floats.
 
 Presliding friction follows Canudas de Wit, Olsson, Astrom and Lischinsky (IEEE Transactions on Automatic Control 40
-(1995) 419): bristles deflect with the joint and slip more the further they are deflected,
+(1995) 419): bristles deflect with the joint and slip,
 
     friction = stiffness deflection + damping deflection'
     deflection' = velocity (1 - stiffness deflection / +-level)

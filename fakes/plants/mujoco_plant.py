@@ -5,7 +5,7 @@
     plant_options = { model = "arm.xml", joints = ["shoulder", "elbow"], torque_constant = [1.8, 1.8] }
 
 Friction, armature and limits are those of the model's joints; its actuators are not used. The motor torque, current
-times torque constant, is applied directly to the joint. Joint angles are those of the model.
+times torque constant, is applied directly to the joint.
 """
 
 from collections.abc import Sequence
@@ -55,11 +55,9 @@ class MujocoPlant:
         return [float(current) for current in self._current]
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Block a joint, or release it."""
         self._jammed[joint] = jammed
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._held_at[joint] = velocity
 
     def advance(self, until: float, current: Sequence[float]) -> None:

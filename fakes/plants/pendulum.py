@@ -37,11 +37,9 @@ class Pendulum:
         return (self._motor.current,)
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Block the joint, or release it."""
         self._motor.jammed = jammed
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._motor.held_at = velocity
 
     def advance(self, until: float, current: Sequence[float]) -> None:

@@ -13,8 +13,7 @@ parameters; a test compares the two.
 
 Time integration is symmetric and second-order: drift half a step, kick with the step's mean motor torque and the
 friction at its middle, drift half a step. Dry friction is an impulse on each joint, limited to its level times the step
-and just large enough to bring the joint to rest, so stiction is exact. A step in which a joint's velocity changes sign
-is split there.
+and just large enough to bring the joint to rest, so stiction is exact.
 
 In a process that has loaded numba anyway, as hil's own experiments do, the loop is compiled for arms with plain drives;
 the results are bitwise identical. Otherwise, the loop is interpreted.
@@ -78,12 +77,10 @@ class TwoLink:
         return self._state[6:]
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Block a joint, or release it."""
         self._motors[joint].jammed = jammed
         self._drives_changed()
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._motors[joint].held_at = velocity
         self._drives_changed()
 

@@ -1,8 +1,7 @@
 """Effects of a servo's own current: heating and overload. Both are off unless the description specifies them.
 
 Source of the error bits: ROBOTIS e-Manual, Shutdown and Hardware Error Status. The firmware's criterion for an overload
-is not published. Here, it is a current above a threshold for a given time; the timer runs down at the same rate while
-the current is lower.
+is not published; here, it is a current above a threshold for a given time.
 """
 
 from typing import Annotated

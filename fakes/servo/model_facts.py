@@ -1,16 +1,14 @@
 """Properties missing from the SDK's control tables: registers' access, factory values and ranges; motor constants.
 
-Source: ROBOTIS e-Manual, pages x/<model> and, for the motors, _data/dxl_x_info.yml and
-_includes/common/compatible_dxl/ of its repository ROBOTIS-GIT/emanual (revisions of 2018 to 2024). Differences from
-some revisions: the range of Min Voltage Limit, given there as 110 to 300 with a factory value of 95, is 95 to 160 here
-as on the sister models. Protocol Type only accepts 2, because a fake servo does not support any other. Drive Mode
-accepts bit 3 (Torque On by Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the
-others. Velocity Limit of the XH430-W210 is that of the XD430-T210, whose control table is identical according to the
-manual; the oldest page of the XH430-W210 states 360.
+Source: ROBOTIS e-Manual, pages x/<model> and, for the motors, _data/dxl_x_info.yml and _includes/common/compatible_dxl/
+of its repository ROBOTIS-GIT/emanual (revisions of 2018 to 2024). Differences from some revisions: the range of Min
+Voltage Limit, given there as 110 to 300 with a factory value of 95, is 95 to 160 here as on the sister models. Protocol
+Type only accepts 2, because a fake servo does not support any other. Drive Mode accepts bit 3 (Torque On by Goal
+Update), which is on the page of the XL430-W250 but missing from older revisions of the others. Velocity Limit of the
+XH430-W210 is that of the XD430-T210; its own oldest page states 360.
 
 Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
-tens of percent, which is enough to make a position move look right. The XC330s' stall currents are uncertain: their
-sensor is in the supply line.
+tens of percent, which is enough to make a position move look right.
 """
 
 import math
@@ -204,7 +202,6 @@ def _xc330(motor: Motor, velocity: int, gains: Mapping[str, RegisterFacts]) -> M
 
 
 def _voltage_driven(motor: Motor, differs: Mapping[str, RegisterFacts]) -> ModelFacts:
-    """Describe a model without a current sensor."""
     return ModelFacts(motor, differs, current_unit_a=0.0, operating_modes=frozenset({1, 3, 4, 16}))
 
 

@@ -5,8 +5,7 @@ Addresses, sizes and signs come from `hil.drivers.control_table`; area, access, 
 tables leave out, are added here from the e-Manual (pages x/<model>). The address of the 330 series' indirect data
 depends on the firmware: see `ModelFacts.indirect_of_firmware`.
 
-A model outside the X series follows its table in the SDK: its registers hold what is written to them, within their
-size, and its motor does not move.
+A model outside the X series follows its table in the SDK; its motor does not move.
 """
 
 from collections.abc import Iterator, Mapping
@@ -146,7 +145,6 @@ def _indirect_registers(blocks: Blocks) -> Iterator[Register]:
 
 
 def _unknown(name: str) -> EmulatedModel:
-    """Return a model for which only addresses and sizes are known."""
     addresses = load_control_table(name)
     torque = addresses.registers.get("Torque Enable")
     ram = torque.address if torque is not None else 64

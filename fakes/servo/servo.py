@@ -205,7 +205,6 @@ class EmulatedServo(Powered):
     # Queries for tests
 
     def value(self, name: str) -> int:
-        """Return the register's current content; raises KeyError if the model has no such register."""
         return self.memory.value(name)
 
     @property
@@ -385,7 +384,6 @@ class EmulatedServo(Powered):
         self._hold_position()
 
     def _hold_position(self) -> None:
-        """Set Goal Position to the joint's present position."""
         ticks = self.present.ticks(self._angle())
         if self.model.operating_modes:
             self.memory.set("Goal Position", round(ticks))

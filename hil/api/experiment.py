@@ -127,7 +127,6 @@ def record(
 
 
 def _earlier(config: Config, shown: Path, path: Path) -> Result:
-    """Read the result of an earlier run. Raises ConfigError, ResultError, RunFolderError."""
     if config.is_chain or not config.experiment.pilot:
         why = "this arm is spatial" if config.is_chain else "this file gives peak_torque, so no pilot runs"
         raise ConfigError(
@@ -138,7 +137,6 @@ def _earlier(config: Config, shown: Path, path: Path) -> Result:
 
 
 def _tell_doubts(config: Config, tell: OnProgress) -> None:
-    """Report warnings about the configuration and the description, before anything moves."""
     for doubt in doubts(config):
         tell(Progress("experiment", f"Warning: {doubt}"))
 

@@ -200,7 +200,6 @@ def load_run(path: str | PathLike[str]) -> Run:
 
 
 def with_run(result: Result, run: Path) -> Identification | Estimation:
-    """Return the result together with its run folder `run`."""
     if isinstance(result, SettledResult):
         return identification(result, run)
     assert isinstance(result, ShootingResult)

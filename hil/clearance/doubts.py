@@ -59,7 +59,6 @@ def _same_direction(config: Config, joint: JointConfig) -> str:
 
 
 def _how_to_compare(config: Config) -> str:
-    """Say how to find out which way the two servos of a joint turn."""
     if config.arm.urdf is not None:
         guided = command("pose", config.path, "--guide")
         return (

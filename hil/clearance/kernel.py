@@ -1,7 +1,7 @@
 """Compiled functions: capsule positions along a motion, and the smallest distance among pairs that must not touch.
 
-Distances between segments follow Ericson, Real-Time Collision Detection (2005), 5.1.9. The distance from a segment to a
-box is convex along the segment, so a golden-section search finds its minimum.
+Distances between segments follow Ericson, Real-Time Collision Detection (2005), 5.1.9. The distance to a box is convex
+along a segment, so a golden-section search finds its minimum.
 """
 
 import math

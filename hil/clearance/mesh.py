@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hil.estimator.arrays import Array
 
 MOST_BYTES = 200_000_000
 _HEADER, _TRIANGLE = 84, 50

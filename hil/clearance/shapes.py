@@ -1,8 +1,7 @@
 """Capsules that enclose each link: from the collision geometry in the arm's file, otherwise from the joint
 positions.
 
-A capsule is the set of points within its radius of a line segment. Spheres are represented exactly. A cylinder is
-enclosed by one capsule, a box by one capsule or a row of them. A mesh is replaced by its bounding box. A link whose
+A capsule is the set of points within its radius of a line segment. A mesh is replaced by its bounding box. A link whose
 geometry cannot be read gets a capsule from joint to joint with a guessed radius, and is listed in `Shapes.guessed`.
 """
 
@@ -12,15 +11,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.clearance.mesh import UnreadMesh, mesh_corners
 from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import is_mjcf
 from hil.description.mjcf import Geom, read_geoms
 from hil.description.urdf import MOST_LENGTH, parse_urdf, rotation_of
+from hil.estimator.arrays import Array
 
-Array = NDArray[np.float64]
 Placed = tuple[int, Array, Array, ET.Element | None]
 
 GUESSED_SHARE, GUESSED_LEAST, GUESSED_MOST = 0.2, 0.015, 0.05
@@ -86,7 +84,6 @@ def shapes_of(arm: ArmDescription) -> Shapes:
 
 
 def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule], is_last: bool) -> str:
-    """Say why the shape of a link is not known, and what replaces it."""
     why = "; ".join(unread) if unread else "it has no collision or visual geometry"
     if not instead:
         left = "Only its other shapes are checked" if has_others else "It has no shape"
@@ -270,8 +267,8 @@ def _of_box(centre: Array, size: Array) -> list[tuple[Array, float]]:
 def _from_joints(arm: ArmDescription, link: int, fixed: list[Array]) -> list[Capsule]:
     """A capsule from the link's joint to the next one.
 
-    The last link's capsule ends at the farthest frame fixed to it, or at twice the distance of its centre of mass if
-    that is farther.
+    The last link's capsule ends at the farthest frame fixed to it or, if farther, at twice the distance of its centre
+    of mass.
     """
     if link < len(arm.joints):
         end = arm.joints[link].translation

@@ -15,8 +15,7 @@ from hil.config.schema import Config
 from hil.description.arm import ArmDescription
 from hil.description.motion import rotation_about
 from hil.description.urdf import rotation_of
-
-Array = NDArray[np.float64]
+from hil.estimator.arrays import Array, Mask
 
 ALWAYS_SHARE = 0.9
 """Two capsules that are closer than the margin in at least this fraction of random poses are assumed to touch by
@@ -84,7 +83,7 @@ class Space:
     """The rest pose (joints,) [rad]."""
     at_rest: Array
     """Distance of each pair in the rest pose (pairs,) [m]."""
-    is_touched: NDArray[np.bool_]
+    is_touched: Mask
     """Whether, in the rest pose, anything may touch the part of the arm that each joint moves (joints,)."""
     _built: Array
     """Median distance of pairs that are near each other by design, otherwise infinite (pairs,) [m]."""
@@ -108,16 +107,15 @@ class Space:
     def has_reserve(self, position: Array, reserve: float) -> bool:
         """Whether a motion (joints, samples) [rad] keeps `reserve` [m] more than the required distance.
 
-        For pairs that are near each other by design, half of their median distance is enough if that is less than
-        `reserve`.
+        For pairs near each other by design, half of their median distance is enough.
         """
         needed = self._needed(False)
         needed = np.minimum(needed + reserve, np.maximum(needed, 0.5 * self._built))
         return bool(self._least(position, needed, False)[0].min() >= 0.0)
 
-    def lies(self, position: Array) -> NDArray[np.bool_]:
+    def lies(self, position: Array) -> Mask:
         """Whether each pose (samples,) of a motion (joints, samples) [rad] is within LYING_RAD of the rest pose."""
-        near: NDArray[np.bool_] = np.abs(position.T - self.rest).max(axis=1) < LYING_RAD
+        near: Mask = np.abs(position.T - self.rest).max(axis=1) < LYING_RAD
         return near
 
     def nearest(self, position: Array, on_the_way: bool = False) -> Nearest:
@@ -177,7 +175,6 @@ class Space:
         return self._arrays[0]
 
     def names_of(self, pair: int) -> tuple[str, str]:
-        """Names of the two members of a pair."""
         link = self._arrays[0]
         first, second = self._pairs[pair]
         return self.shapes.names[link[first]], self._partner(int(second))
@@ -270,7 +267,7 @@ def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool)
 
 def _by_design(
     config: Config, chain: object, arrays: tuple[Any, ...], pairs: NDArray[np.int64], margin: float
-) -> tuple[NDArray[np.bool_], Array]:
+) -> tuple[Mask, Array]:
     """Whether the capsules of each pair (pairs,) are closer than the margin in nearly every pose within the limits.
 
     Also returns the median distance of pairs that are near each other in most poses (pairs,) [m]; infinite for others.
@@ -281,7 +278,7 @@ def _by_design(
     distance = np.empty((RANDOM_POSES, len(pairs)))
     all_distances(chain, arrays, pairs, poses, distance)
     are_links = pairs[:, 1] >= 0
-    touching: NDArray[np.bool_] = are_links & ((distance < margin).mean(axis=0) >= ALWAYS_SHARE)
+    touching: Mask = are_links & ((distance < margin).mean(axis=0) >= ALWAYS_SHARE)
     apart = np.abs(link[pairs[:, 0]] - link[np.maximum(pairs[:, 1], 0)])
     share = np.where(apart == 2, NEAR_SHARE, NEAR_SHARE_OF_OTHERS)
     is_near = are_links & ((distance < margin + BUILT_NEAR).mean(axis=0) >= share)
@@ -289,7 +286,7 @@ def _by_design(
     return touching, np.where(is_near, median, np.inf)
 
 
-def _touched(joints: int, link: NDArray[np.int64], contacts: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _touched(joints: int, link: NDArray[np.int64], contacts: NDArray[np.int64]) -> Mask:
     """For each joint (joints,): whether a contact (contacts, 2) is between a part that it moves and one that it does
     not.
     """

@@ -41,7 +41,6 @@ def describe_fake(config: Path, faults: list[str], moves: list[str], seed: int |
 
 
 def list_faults() -> None:
-    """Print every kind of fault and its effect."""
     for kind, facts in FAULTS.items():
         amount = f"; amount: {facts.amount}, default {facts.default:g}" if facts.amount else ""
         print(f"{kind:22s} {facts.does}{amount}")

@@ -80,7 +80,6 @@ def export(
 
 
 def write_report(run: Path, out: Path | None = None) -> Path:
-    """Write a run's report, by default to the run folder; return the report's path."""
     from hil.report import page
     from hil.report.recording_page import write_recording_report
     from hil.report.run_data import RunData

@@ -71,8 +71,6 @@ def study(
 
 
 class _shown:  # noqa: N801, a context manager that reads as a verb
-    """Show a progress bar and the scheduler's dashboard address on standard error."""
-
     def __init__(self, console: "Console") -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -128,7 +128,6 @@ class Terminal:
 
 
 def _bar(console: Console) -> Progress:
-    """Return the line above the joints, as detailed as the terminal width allows."""
     if console.width < _NARROW:
         return Progress(
             TextColumn("{task.description}"),

@@ -1,7 +1,6 @@
 """Add -v and -q to every subcommand; they control how much the logger `hil` writes to standard error.
 
-Without either, a command reports its progress and its errors. -v adds log messages and -vv debug messages; -q leaves
-only the result on standard output and errors on standard error.
+-v adds log messages and -vv debug messages; -q leaves only the result on standard output and errors on standard error.
 """
 
 import inspect
@@ -22,7 +21,6 @@ _Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show only the resul
 
 
 def with_verbosity(command: Callable[..., None]) -> Callable[..., None]:
-    """Add --verbose and --quiet to a subcommand."""
 
     @wraps(command)
     def run(*args: Any, verbose: int, quiet: bool, **options: Any) -> None:
@@ -43,7 +41,6 @@ def with_verbosity(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def is_quiet() -> bool:
-    """Whether -q was given."""
     return logging.getLogger("hil").level > logging.WARNING
 
 

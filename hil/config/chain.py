@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import read_arm
 from hil.description.planar import is_planar
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
+from hil.estimator.arrays import Array
 from hil.unit_hints import in_other_units
 
 if TYPE_CHECKING:
@@ -48,8 +48,7 @@ def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
 def doubted_limits(config: "Config") -> Iterator[str]:
     """Yield one sentence per joint whose limits in the description make no sense or do not contain its path.
 
-    position_limit may exceed the described limits at either end by the margin that a path leaves free, since it only
-    serves to stop the arm and some arms rest on a mechanical stop.
+    position_limit may exceed the described limits at either end by the margin that a path leaves free.
     """
     arm = described_arm(config)
     wanted = config.joint_path
@@ -93,7 +92,7 @@ def doubted_gravity(config: "Config") -> Iterator[str]:
     )
 
 
-def _mounted(gravity: NDArray[np.float64]) -> str:
+def _mounted(gravity: Array) -> str:
     """Say which settings give this gravity in the frame of the base (3,) [m/s^2]."""
     strength = float(np.linalg.norm(gravity))
     if strength <= _SAME_GRAVITY:
@@ -103,16 +102,16 @@ def _mounted(gravity: NDArray[np.float64]) -> str:
     return f"If the arm is mounted as the file says, set base = {base} and gravity = {strength:.4g} under [arm]."
 
 
-def base_gravity(config: "Config") -> NDArray[np.float64]:
+def base_gravity(config: "Config") -> Array:
     """Gravity in the base frame (3,) [m/s^2]."""
     down = np.array([0.0, 0.0, -config.arm.gravity])
-    turned: NDArray[np.float64] = rotation_of(*config.arm.base).T @ down
+    turned: Array = rotation_of(*config.arm.base).T @ down
     return turned
 
 
-def base_up(config: "Config") -> NDArray[np.float64]:
+def base_up(config: "Config") -> Array:
     """The direction opposite to gravity in the base frame (3,)."""
-    turned: NDArray[np.float64] = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, 1.0])
+    turned: Array = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, 1.0])
     return turned
 
 

@@ -1,7 +1,6 @@
-"""The JSON Schema of the TOML file, generated from the models that check it. Editors use it for completion and checks.
+"""The JSON Schema of the TOML file, generated from the models that check it.
 
-It describes single values and tables. Constraints between values (a rest pose within the position limits, one entry per
-joint) are checked only by `load_config`.
+Constraints between values are checked only by `load_config`.
 """
 
 import json

@@ -245,7 +245,6 @@ class Config(Table):
         return self
 
     def _per_joint(self) -> list[tuple[str, list[float]]]:
-        """Every list that needs one entry per joint, by its key."""
         lists = {"experiment.peak_torque": self.experiment.peak_torque, "arm.link_lengths": self.arm.link_lengths}
         if self.stabiliser is not None:
             lists |= {"stabiliser.stiffness": self.stabiliser.stiffness, "stabiliser.damping": self.stabiliser.damping}
@@ -305,7 +304,6 @@ class Config(Table):
 
     @property
     def bus(self) -> BusConfig:
-        """The configuration of the bus driver."""
         return BusConfig(
             self.url,
             self.port.baud,

@@ -27,7 +27,6 @@ class Body:
 
     @classmethod
     def nothing(cls) -> "Body":
-        """Return a body without mass."""
         return cls(0.0, np.zeros(3), np.zeros((3, 3)))
 
     def moved(self, rotation: Array, translation: Array) -> "Body":

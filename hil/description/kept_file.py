@@ -11,9 +11,8 @@ from hil.description.files import is_mjcf
 def kept_bytes(path: Path) -> bytes:
     """Return the bytes to store as the copy of a URDF or MJCF file. Raises OSError, ArmFileError.
 
-    A URDF is kept as it is: without its meshes it still has all inertias. MuJoCo, however, cannot read an MJCF whose
-    meshes, textures or included files are missing. Such a file is kept with everything included, the inertias computed
-    by MuJoCo written out, and the shapes that need another file left out.
+    A URDF is kept as it is. MuJoCo cannot read an MJCF whose meshes, textures or included files are missing: such a
+    file is kept self-contained, without shapes that need another file.
     """
     if not is_mjcf(path) or not (text := _self_contained(path)):
         return path.read_bytes()

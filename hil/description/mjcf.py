@@ -286,7 +286,6 @@ class _Tree:
 
 
 def _listed(what: str, names: list[str]) -> str:
-    """Return the names followed by "has" or "have"."""
     plural = {"joint": "joints", "body": "bodies"}[what]
     quoted = ", ".join(f'"{name}"' for name in names)
     return f"{what} {quoted} has" if len(names) == 1 else f"{plural} {quoted} have"

@@ -40,7 +40,7 @@ def _towards(vector: Array, up: Array) -> str:
     """Name the base's axis that is nearest to a vector, and the direction of this axis for an observer next to the
     arm.
 
-    The observer looks along the base's x axis or, if that is vertical (a base on a wall), along its z axis.
+    The observer looks along the base's x axis or, if that is vertical, along its z axis.
     """
     upwards = int(np.argmax(np.abs(up)))
     forwards = 0 if upwards != 0 else 2

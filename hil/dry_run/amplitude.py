@@ -12,9 +12,8 @@ from hil.config.schema import Config
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import GUARDED, Prediction, predict
 from hil.errors import NoSafeTorque
+from hil.estimator.arrays import Array, Mask
 from hil.plan.plan import Plan, make_plan, scaled
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -24,9 +23,7 @@ class AmplitudeOptions:
     search_arms: int = 32
     """Number of arms simulated during the search; the result is checked on all arms."""
     prior_share: float = 0.9
-    """Fraction of the limits that may be used before any identification: a wide prior has longer tails than the
-    simulated arms show.
-    """
+    """Fraction of the limits that may be used before any identification."""
     max_rounds: int = 12
     """Maximum number of search iterations, and of subsequent torque reductions."""
     max_polishing_rounds: int = 4
@@ -47,9 +44,7 @@ class AmplitudeOptions:
     """
     min_exponent: float = 0.4
     least_change: float = 0.005
-    """The search stops if the torque would change by less than this fraction: another iteration would not be worth its
-    simulations.
-    """
+    """The search stops if the torque would change by less than this fraction."""
     polishing_ratio: float = 1.06
     """Factor by which each of the final increases raises a joint's torque."""
     worst_arms: int = 4
@@ -213,7 +208,7 @@ def _too_many(config: Config, plan: Plan, few: Ensemble, share: float, pose: Arr
     return bool(passed.sum() > config.safety.limit_chance * count)
 
 
-def _passed(prediction: Prediction, share: float) -> NDArray[np.bool_]:
+def _passed(prediction: Prediction, share: float) -> Mask:
     """Whether each arm exceeds `share` of a limit (arms,)."""
     return np.asarray((prediction.shares[:, :GUARDED] >= share).any(axis=(1, 2)))
 

@@ -1,8 +1,7 @@
 """Check whether an unpowered arm has too little energy to leave its position limits.
 
-Friction only dissipates energy, so an unpowered arm cannot reach a pose with more potential energy than its total
-energy. If every pose on the boundary of the permitted range has more, the arm stays inside, and its swing need not be
-simulated.
+An unpowered arm cannot reach a pose with more potential energy than its total energy. If every pose on the boundary of
+the permitted range has more, its swing need not be simulated.
 """
 
 from dataclasses import dataclass
@@ -10,11 +9,9 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import CONSTANTS, Physics
-
-Array = NDArray[np.float64]
 
 _POINTS = 181
 """Number of angles of the other joint at which the potential energy on the boundary is evaluated."""

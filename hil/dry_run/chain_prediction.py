@@ -6,19 +6,17 @@ Each arm follows every path in full: the transition from the rest pose, two peri
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.clearance.space import Nearest, Space
 from hil.config.schema import Config
 from hil.dry_run.prediction import Prediction, limits_of, peaks_of
 from hil.dry_run.resting_stops import planned_paths, resting_stops
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.chain.simulation.rollout import ChainArms, Loop, Motions, roll_out
 from hil.estimator.progress import Tell, counted
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan
-
-Array = NDArray[np.float64]
 
 PERIODS = 2
 SHOWN = 30
@@ -63,7 +61,7 @@ def predict_chain(
     arms: ChainArms,
     tell: Tell | None = None,
     shown: int = 0,
-    passed: NDArray[np.bool_] | None = None,
+    passed: Mask | None = None,
 ) -> ChainPrediction:
     """Simulate `plan` on every arm. Raises ArmFileError, ConfigError.
 

@@ -1,4 +1,4 @@
-"""Prior ensemble of spatial arms, before anything has been identified.
+"""Prior ensemble of spatial arms.
 
 Each link's mass, centre of mass and inertia are drawn around their described values; friction and rotor inertia are
 drawn around typical values of the servos. `[arm.prior] spread` is the relative standard deviation of the described
@@ -6,18 +6,16 @@ masses.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config, PriorConfig
 from hil.description.arm import steiner
 from hil.drivers.servo_model import Mode
 from hil.drivers.servo_prior import servo_prior
+from hil.estimator.arrays import Array
 from hil.estimator.chain.model.dynamics import TERMS
 from hil.estimator.chain.model.late_torque import MOST_LOST
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.plan.chain_model import KnownChain, torque_constant_stds
-
-Array = NDArray[np.float64]
 
 CENTRE_STD = 0.01  # m, in each direction
 INERTIA_SPREAD = 0.3

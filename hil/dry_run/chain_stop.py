@@ -1,26 +1,24 @@
 """Simulated stops of a spatial arm, which is lowered if its servos still accept commands, and falls if they do not.
 
-Stops begin at times spread over the planned path, on arms of the ensemble. For each stop, two motions are simulated:
-the path home as the stream would command it, and the unpowered fall up to the first collision.
+Stops begin at times spread over the planned path. For each, the path home and the unpowered fall up to the first
+collision are simulated.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.clearance.space import LYING_RAD, Nearest, Space
 from hil.config.schema import Config
 from hil.dry_run.resting_stops import planned_paths, resting_stops
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.chain.simulation.rollout import COULOMB, SCALE, ChainArms, Loop, Pull, roll_out, weights
 from hil.estimator.progress import Tell, counted
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan
 from hil.plan.way_home import PULL_PER_S, PULL_SHARE, WayHome
-
-Array = NDArray[np.float64]
 
 MOMENTS, ARMS = 16, 6
 FALL_S = 1.5
@@ -93,7 +91,7 @@ def foreseen_stops(
     plan: Plan,
     arms: ChainArms,
     tell: Tell | None = None,
-    passed: NDArray[np.bool_] | None = None,
+    passed: Mask | None = None,
 ) -> ChainStops:
     """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError.
 

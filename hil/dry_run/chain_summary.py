@@ -130,7 +130,6 @@ def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
 
 
 def print_chain_dry_run(run: ChainDryRun, console: Console) -> None:
-    """Print the table and the verdict."""
     print_fitting(console, _table(run))
     for line in (*run.servos, *chain_dry_run_lines(run)):
         say(console, line)

@@ -10,19 +10,15 @@ from hil.config.schema import Config
 from hil.dry_run.prior import base_draws
 from hil.errors import ConfigError
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS
+from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
 from hil.model_file import model_of, read_result
 from hil.plan.chain_model import torque_constant_stds
 from hil.results.result import Result
 
-Array = NDArray[np.float64]
-
 MODEL_SPREAD = 0.005
-"""Relative standard deviation added to every identified parameter for model error, which the covariance omits.
-
-It is multiplied by the ratio of the simulated range of motion to the range used for identification.
-"""
+"""Relative standard deviation added to every identified parameter for model error, which the covariance omits."""
 
 _LEAST_SHARE = 0.05  # smallest allowed fraction of a positive parameter's nominal value
 _LEAST_WIDTH = 0.01  # rad/s, width of the Coulomb step: narrower steps change little and take longer to simulate
@@ -47,11 +43,9 @@ class Ensemble:
         return len(self.physics)
 
     def first(self, count: int) -> "Ensemble":
-        """The first `count` arms as an ensemble."""
         return Ensemble(self.physics[:count], self.torque_scale[:count], self.source)
 
     def only(self, arms: NDArray[np.intp]) -> "Ensemble":
-        """The arms with these indices as an ensemble."""
         return Ensemble(tuple(self.physics[arm] for arm in arms), self.torque_scale[arms], self.source)
 
 
@@ -92,16 +86,13 @@ def _joints(count: int) -> str:
     return "1 joint" if count == 1 else f"{count} joints"
 
 
-def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
-    """Draw arms from a result. Its covariance is widened by the model error that the residual indicates.
-
-    farther: ratio of the range of motion to be simulated to the range used for identification.
-    """
-    physics = tuple(Physics.of(each) for each in result_draws(result, count, farther, seed))
+def result_ensemble(result: Result, count: int) -> Ensemble:
+    """Draw arms from a result. Its covariance is widened by the model error that the residual indicates."""
+    physics = tuple(Physics.of(each) for each in result_draws(result, count))
     return Ensemble(physics, np.ones((count, result.joints)), "result")
 
 
-def result_draws(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> list[dict[str, float]]:
+def result_draws(result: Result, count: int) -> list[dict[str, float]]:
     """Draw the parameters of `count` arms as in `result_ensemble`, keyed by the estimator's names [SI]."""
     names = result.covariance.names
     covariance = result.covariance.array()
@@ -111,8 +102,8 @@ def result_draws(result: Result, count: int, farther: float = 1.0, seed: int = 0
     covariance = np.where(np.isfinite(covariance), covariance, 0.0)
     # A residual above rounding indicates model error, which shifts parameters by more than their covariance suggests.
     widened = covariance * max(1.0, ticks / QUANTISATION_FLOOR_TICKS) ** 2
-    extra = np.diag((MODEL_SPREAD * max(1.0, farther) * value) ** 2)
-    random = np.random.default_rng((seed, 7))
+    extra = np.diag((MODEL_SPREAD * value) ** 2)
+    random = np.random.default_rng((0, 7))
     drawn = _draws(random, value, widened + extra, count)
     return [_physical(dict(zip(names, row.tolist(), strict=True)), known) for row in drawn]
 

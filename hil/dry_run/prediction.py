@@ -1,9 +1,8 @@
 """Simulate the experiment on an ensemble of arms, and compare the predicted peaks with each limit.
 
-Every arm of the ensemble receives exactly the goal currents of the plan, ramps included, for as many periods as it
-takes to settle. The goals are rounded to the servos' ticks; lag and stabiliser are simulated. Peaks are expressed as
-fractions of the distance from rest to the limit; if any of an arm's fractions reaches 1, the guard would have stopped
-that arm.
+Every arm receives the goal currents of the plan, ramps included and rounded to the servos' ticks, for as many periods
+as it takes to settle. If a peak reaches 1 as a fraction of the distance from rest to the limit, the guard would have
+stopped that arm.
 """
 
 from collections.abc import Sequence
@@ -19,12 +18,11 @@ from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.rollout import commands_of, simulate_experiment
+from hil.estimator.arrays import Array
 from hil.estimator.simulation.closed_loop import Feedback
 from hil.estimator.simulation.many_arms import LOWEST, TORQUE, Commands, ManyArms, SettlingRule
 from hil.plan.plan import Plan
 from hil.plan.stabiliser import feedback_of
-
-Array = NDArray[np.float64]
 
 QUANTITIES = ("lowest position", "highest position", "velocity", "current", "torque", "power")
 UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")

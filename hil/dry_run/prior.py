@@ -1,22 +1,20 @@
 """Prior knowledge of an arm before identification: masses, lengths and friction, each with its spread.
 
-`[arm.prior]` gives what the user knows. The rest is estimated from link lengths by the rules of thumb below, which are
-based on only a few arms, and from the servo models (hil.drivers.servo_prior); both have a wide spread.
+`[arm.prior]` gives what the user knows. The rest is estimated from link lengths by the rules of thumb below, and from
+the servo models (hil.drivers.servo_prior).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config, PriorConfig
 from hil.drivers.servo_model import Mode
 from hil.drivers.servo_prior import servo_prior, stall_torque
 from hil.errors import ConfigError
 from hil.estimation.model_from_config import voltage_driven
+from hil.estimator.arrays import Array
 from hil.estimator.models.terms import term_of
-
-Array = NDArray[np.float64]
 
 _LINK_MASS_PER_LENGTH = 1.1  # kg/m, for XM430 servos with printed or aluminium brackets
 _USUAL_STALL = 4.1  # N m, stall torque of those servos; smaller servos carry lighter links

@@ -1,23 +1,21 @@
 """Infer which joints of a spatial arm lie on their own mechanical stops in the rest pose.
 
-In the rest pose an arm lies without torque. It is supported by a surface (floor, cradle, another link) or by the
-joints' own stops. Moving the arm can lift it off a surface; a stop holds its joint whatever the angles of the others.
+In the rest pose an arm is supported by a surface (floor, cradle, another link) or by the joints' own stops. Moving the
+arm can lift it off a surface; a stop holds its joint whatever the angles of the others.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.clearance.space import Space
 from hil.config.chain import described_arm
 from hil.config.schema import Config
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.chain.simulation.rollout import PRESSED_SHARE, ChainArms, weights
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan
-
-Array = NDArray[np.float64]
 
 NEAR_STOP_RAD = 0.14
 """A joint that lies on its stop is at most this far from the end of its range, as configured or described [rad]."""
@@ -27,16 +25,14 @@ PASSED_RAD = 0.05
 """A joint that has been this far [rad] beyond its rest pose does not lie on a stop there: no stop yields that much."""
 
 
-def resting_stops(
-    config: Config, arms: ChainArms, planned: Sequence[Array] = (), passed: NDArray[np.bool_] | None = None
-) -> Array:
+def resting_stops(config: Config, arms: ChainArms, planned: Sequence[Array] = (), passed: Mask | None = None) -> Array:
     """Side on which each joint lies on its stop (joints,): -1 at its smallest angle, 1 at its largest, 0 if on neither.
 
     A joint is assumed to lie on its stop if its rest pose is near the end of its range, nothing else touches the part
-    of the arm that it moves, and gravity does not pull it away from there. If the description lacks a support, the
-    joint is taken to lie on its stop until a recording shows it beyond its rest pose, or a planned path takes it there,
-    within its configured limits. planned: positions of these paths, each (joints, samples) [rad]. passed: whether each
-    joint has been below and above its rest pose, as returned by `passed_rest` (2, joints). Raises ArmFileError.
+    of the arm that it moves, and gravity does not pull it away from there. This assumption ends when a recording shows
+    the joint beyond its rest pose, or a planned path takes it there, within its configured limits. planned: positions
+    of these paths, each (joints, samples) [rad]. passed: whether each joint has been below and above its rest pose, as
+    returned by `passed_rest` (2, joints). Raises ArmFileError.
     """
     rest = np.array(config.arm.rest_pose)
     low, high = _ends(config, rest)
@@ -51,11 +47,11 @@ def resting_stops(
     return side
 
 
-def passed_rest(config: Config, position: Array) -> NDArray[np.bool_]:
+def passed_rest(config: Config, position: Array) -> Mask:
     """Whether each joint was ever below (row 0) or above (row 1) its rest pose in a recording (samples, joints)."""
     away = position - np.array(config.arm.rest_pose)
     away = np.where(np.isfinite(away), away, 0.0)
-    found: NDArray[np.bool_] = np.stack((away.min(axis=0) < -PASSED_RAD, away.max(axis=0) > PASSED_RAD))
+    found: Mask = np.stack((away.min(axis=0) < -PASSED_RAD, away.max(axis=0) > PASSED_RAD))
     return found
 
 

@@ -3,17 +3,15 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.estimator.arrays import Array
 from hil.estimator.data.periodicity import settling_difference
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
 from hil.estimator.simulation.many_arms import Commands
 from hil.plan.plan import Plan, Segment
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,6 @@ planned   the run is stopped at any moment of the planned motion, because of a s
 passed    the motion differs from the plan (a blocked, reversed or unpowered joint, or an arm other than the one
           described), so the guard stops it at a limit: one joint at its position limit moves outwards at its velocity
           limit; the other is anywhere within its range
-
-As in a dry run, rigid links, friction, current lag, and servos that behave as documented are assumed.
 """
 
 import math
@@ -19,12 +17,12 @@ from enum import StrEnum
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.bounded_energy import Boundary, boundary
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import scaled_feedback
+from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import CONSTANTS, Physics
 from hil.estimator.simulation.closed_loop import Feedback, Response, Simulator, respond, resting
 from hil.estimator.simulation.many_arms import COARSE
@@ -33,8 +31,6 @@ from hil.plan.brake import GETS_FASTER, NOTICED_AFTER, braking_gains
 from hil.plan.plan import Plan
 from hil.plan.silence import missing_limit
 from hil.plan.stabiliser import feedback_of
-
-Array = NDArray[np.float64]
 
 LONGEST_S = 1.5
 """Time for which a stopped arm is simulated [s]: long enough for a swing and its return."""
@@ -48,10 +44,7 @@ overshoot.
 _EVENLY = 16
 _IMMOVABLE = 1e3  # kg m^2
 _JUDGED_AFTER_S = (0.05, 0.2, 0.5)
-"""Times after torque is cut at which a simulation ends if the arm has too little energy to leave its limits [s].
-
-The first is many time constants of the current's lag, so that the motor no longer adds energy.
-"""
+"""Times after torque is cut at which a simulation ends if the arm has too little energy to leave its limits [s]."""
 _REACTION = 2
 """Samples until the stop takes effect: the sample that shows the fault, and the one in progress."""
 

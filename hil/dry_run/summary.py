@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -13,6 +12,7 @@ from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
 from hil.dry_run.prediction import Prediction, quantities_of
 from hil.dry_run.stopping_distance import Stopping, Way
+from hil.estimator.arrays import Array
 from hil.estimator.selection.verdict import percent
 from hil.printing import print_fitting, say
 
@@ -28,7 +28,7 @@ class FirstRun:
     whole range, its position limits are closer to the rest pose.
     """
 
-    peak_torque: NDArray[np.float64]
+    peak_torque: Array
     prediction: Prediction
     played: Config
 
@@ -92,7 +92,7 @@ def dry_run_json(config: Config, run: DryRun) -> dict[str, Any]:
     }
 
 
-def _rounded(values: NDArray[np.float64]) -> list[float]:
+def _rounded(values: Array) -> list[float]:
     return [round(float(value), 4) for value in values]
 
 
@@ -106,12 +106,11 @@ def _first_json(first: FirstRun) -> dict[str, Any]:
     }
 
 
-def _ways_json(ways: dict[Way, NDArray[np.float64]]) -> dict[str, list[float]]:
+def _ways_json(ways: dict[Way, Array]) -> dict[str, list[float]]:
     return {str(way): [round(float(value), 3) for value in beyond] for way, beyond in ways.items()}
 
 
 def print_dry_run(config: Config, run: DryRun, console: Console) -> None:
-    """Print the table and the verdict."""
     print_fitting(console, _table(config, run.shown, run))
     for line in (*run.servos, *dry_run_lines(config, run.shown, run)):
         say(console, line)
@@ -198,7 +197,6 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
 
 
 def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> list[str]:
-    """Describe what `hil identify` does with pilot = true: stabiliser, first torque, and what may stop it."""
     lines = []
     held = first.played.stabiliser
     if held is not None and config.stabiliser is None:
@@ -227,7 +225,7 @@ def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> 
     ]
 
 
-def _list(values: NDArray[np.float64], digits: int = 2) -> str:
+def _list(values: Array, digits: int = 2) -> str:
     """Format values with `digits` decimals, small ones with two significant digits."""
     return ", ".join(f"{value:.{digits}f}" if value > 10.0 ** (1 - digits) else f"{value:.2g}" for value in values)
 
@@ -240,7 +238,6 @@ def _percent(chance: float) -> str:
 
 
 def _stops(config: Config, stopping: Stopping) -> list[str]:
-    """Say how far each joint goes beyond its position limits when the arm is stopped."""
     planned, passed = stopping.planned, stopping.passed
     stopped, silent = np.maximum(planned[Way.BRAKED], planned[Way.CUT]), planned[Way.SILENT]
     lines = []

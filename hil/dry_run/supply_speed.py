@@ -1,8 +1,7 @@
 """Speed limit set by the supply, which cannot drive the commanded current in either direction near no-load speed.
 
-If the currents fall short of their goals, no parameters can be identified from the run. The dry run and the pilot
-therefore keep joints below this speed, whatever velocity_limit says. In PWM mode the back-EMF is part of the model, and
-no such limit is needed.
+If the currents fall short of their goals, no parameters can be identified from the run. In PWM mode the back-EMF is
+part of the model, and no such limit is needed.
 """
 
 from hil.config.joint import JointConfig

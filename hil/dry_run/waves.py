@@ -6,10 +6,10 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.amplitude import with_peaks
+from hil.estimator.arrays import Array
 from hil.estimator.excitation.multisine import Multisine
 from hil.estimator.excitation.optimal_design import DesignProblem, Limits, design_optimal, smoothed
 from hil.estimator.models.parameters import Physics
@@ -24,8 +24,7 @@ def roomy_plan(config: Config, physics: Physics) -> Plan:
     """The configured plan, with the variant of each multisine that uses the largest part of the arm's position range.
     physics: parameters of the arm.
 
-    The phases determine how evenly an arm swings to both sides. Reversing the sign or time of a wave gives another wave
-    with the same lines and peaks, without a new design.
+    Reversing the sign or time of a wave gives another wave with the same lines and peaks.
     """
     return roomy_plans(config, physics, 1)[0]
 
@@ -64,7 +63,7 @@ def _turned(wave: Multisine) -> list[Multisine]:
     return forward + [_reversed(each) for each in forward]
 
 
-def _signed(wave: Multisine, sign: NDArray[np.float64]) -> Multisine:
+def _signed(wave: Multisine, sign: Array) -> Multisine:
     phases = tuple(
         tuple(phase if s > 0 else (phase + np.pi) % (2 * np.pi) for phase in each)
         for each, s in zip(wave.phases, sign, strict=True)
@@ -104,5 +103,5 @@ def _with_wave(config: Config, segment: Segment, wave: Multisine) -> Segment:
     return replace(segment, multisine=wave, period_current=period_current(config, wave))
 
 
-def _torque_limits(config: Config) -> NDArray[np.float64]:
+def _torque_limits(config: Config) -> Array:
     return np.array([0.97 * joint.goal_limit * joint.torque_per_goal for joint in config.joints])

@@ -4,7 +4,6 @@ import time
 from contextlib import suppress
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.chain import described_arm, doubted_inertias
 from hil.config.schema import Config
@@ -19,6 +18,7 @@ from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.slips.position_jumps import jump_disturbances
 from hil.estimation.torque_constants import RATIO, contradictions, ratios_of
 from hil.estimation.truth import back_emf, scaled
+from hil.estimator.arrays import Array
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import SYSTEMATIC, ChainEstimate, identify_chain
 from hil.estimator.chain.model.base_parameters import BaseParameters
@@ -120,9 +120,8 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
 def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
     """The model requested by the configuration.
 
-    A link moved by several joints couples their torques, so inexact torque constants contradict each other. Their
-    ratios are therefore parameters if the configuration gives an uncertainty. Each joint has its own lag: servo models
-    differ, and neglecting half a millisecond biases the inertias of light joints by several percent.
+    Ratios of torque constants are parameters if the configuration gives an uncertainty. Each joint has its own lag:
+    servo models differ, and neglecting half a millisecond biases the inertias of light joints by several percent.
     """
     wanted = config.model
     scales = known.base.chain.joints > 1 and (wanted.torque_scale or known.prior.scale_precision is not None)
@@ -173,7 +172,7 @@ def chain_facts(arm: ArmDescription, base: BaseParameters, from_prior: tuple[str
     )
 
 
-def unmoved(config: Config, position: NDArray[np.float64]) -> list[str]:
+def unmoved(config: Config, position: Array) -> list[str]:
     """Names of the joints that move too little to be identified. position: (joints, samples) [rad]."""
     reach = np.ptp(np.where(np.isnan(position), np.nanmean(position, axis=1, keepdims=True), position), axis=1)
     return [joint.name for joint, each in zip(config.joints, reach, strict=True) if each < UNMOVED]
@@ -183,11 +182,10 @@ def _verdict(
     config: Config,
     estimate: ChainEstimate,
     known: KnownChain,
-    held_out: NDArray[np.float64] | None,
+    held_out: Array | None,
     still: list[str],
     disturbances: tuple[str, ...] = (),
 ) -> Verdict:
-    """Decide, with reasons, whether the result can be trusted, and name the least well identified base parameter."""
     count = known.base.count
     certain = estimate.std[:count] / known.prior.std
     weakest = known.base.names[int(np.argmax(certain))]
@@ -276,7 +274,7 @@ def about_zeros(config: Config, estimate: ChainEstimate) -> str:
     )
 
 
-def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_prior: tuple[str, ...]) -> str:
+def vague(prior: Prior, names: tuple[str, ...], std: Array, from_prior: tuple[str, ...]) -> str:
     """Name the base parameters not in `from_prior` whose standard errors exceed the prior's; "" if there are none."""
     found = [name for name in prior.surpassing(names, std) if name not in from_prior]
     if not found:
@@ -293,7 +291,6 @@ def is_explained(estimate: ChainEstimate) -> bool:
 
 
 def _unexplained(config: Config, estimate: ChainEstimate) -> str:
-    """Describe the residual relative to the noise, and what it implies for the model."""
     over, joint = float(estimate.over_noise.max()), int(np.argmax(estimate.over_noise))
     noise = float(estimate.noise_steps[joint])
     measured = (

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.estimator.arrays import Array
 
 REACHED = 0.5  # fraction of a limit, below which something else limited the torque
 
@@ -25,9 +26,9 @@ def torque_limit(config: Config, samples: NDArray[np.void], index: int | None = 
             continue
         low, high = joint.position_limit
         rest = config.arm.rest_pose[place]
-        position: NDArray[np.float64] = samples["position"][:, place]
-        goals: NDArray[np.float64] = samples["goal_current"][:, place]
-        velocity: NDArray[np.float64] = samples["velocity"][:, place]
+        position: Array = samples["position"][:, place]
+        goals: Array = samples["goal_current"][:, place]
+        velocity: Array = samples["velocity"][:, place]
         goal = "voltage_limit" if joint.drive_mode is Mode.PWM else "current_limit"
         below, above = rest - np.nanmin(position), np.nanmax(position) - rest
         shares |= {

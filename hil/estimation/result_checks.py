@@ -1,8 +1,8 @@
 """Conversion of the findings of an estimate's checks to the form stored in a result."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array
 from hil.estimator.chain.choice import ChainChoice
 from hil.estimator.selection import distortion, trial, unsettled, validation, verdict
 from hil.results.parts import (
@@ -20,8 +20,8 @@ from hil.results.parts import (
 
 def describe_validation(
     found: validation.Validation,
-    held_out: NDArray[np.float64] | None,
-    held_out_as_fitted: NDArray[np.float64] | None = None,
+    held_out: Array | None,
+    held_out_as_fitted: Array | None = None,
 ) -> Validation:
     """Convert the validation; held_out, held_out_as_fitted: as in `hil.estimator.selection.verdict.Evidence`."""
     first, second, correlation = found.confounded
@@ -51,11 +51,11 @@ def describe_validation(
     )
 
 
-def _per_joint(values: NDArray[np.float64]) -> PerJoint:
+def _per_joint(values: Array) -> PerJoint:
     return tuple(values.tolist())
 
 
-def _listed(values: NDArray[np.float64] | None) -> PerJoint | None:
+def _listed(values: Array | None) -> PerJoint | None:
     return None if values is None else _per_joint(values)
 
 

@@ -23,6 +23,7 @@ from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.slips.position_jumps import jump_disturbances
 from hil.estimation.slips.rest_shift import rest_shift_warnings
+from hil.estimator.arrays import Array
 from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate
@@ -170,7 +171,7 @@ def _as_fitted(estimate: Estimate, other: SettledPeriod | None, drift: Drift | N
     return PlayedPeriod(other.rate, other.torque, other.position, predict_period(estimate, other))
 
 
-def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDArray[np.float64]:
+def _with_neglected(covariance: Array, estimate: Estimate) -> Array:
     """Add the variance due to effects that the back-EMF model neglects."""
     wider = covariance.copy()
     for name, std in neglected(Physics.of(estimate.parameters)).items():
@@ -182,7 +183,7 @@ def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDAr
 def _mean_time(facts: RunFacts, samples: NDArray[np.void], role: str) -> float:
     """Mean time of the last period of a multisine, on the port's clock [s]."""
     phase, segment, period = (samples[name].astype(np.int64) for name in ("phase", "segment", "period"))
-    deadline: NDArray[np.float64] = samples["deadline"]
+    deadline: Array = samples["deadline"]
     played = (phase == Phase.PERIODIC) & (segment == facts.segments.index(role))
     return float(deadline[played & (period == period[played].max())].mean())
 

@@ -10,6 +10,7 @@ from hil.errors import RecordingCutShort
 from hil.estimation.drive.supply import supply_sag, torque_factor
 from hil.estimation.lateness import acting_torque, lateness, velocity_of
 from hil.estimator import linalg
+from hil.estimator.arrays import Array
 from hil.estimator.data.periodicity import settling_difference
 from hil.estimator.data.repeated_noise import coloured_noise, repeated_noise
 from hil.estimator.data.settled_period import SettledPeriod
@@ -80,7 +81,7 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
     )
 
 
-def _passes(position: NDArray[np.float64], first: int, on_time: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+def _passes(position: Array, first: int, on_time: Array) -> tuple[Array, ...]:
     """Second halves of the settled periods `on_time` (periods, joints, samples), and of the period before.
 
     The first half of the period before may still contain a transient.
@@ -89,14 +90,14 @@ def _passes(position: NDArray[np.float64], first: int, on_time: NDArray[np.float
     return position[first - 1, :, half:], *on_time[:, :, half:]
 
 
-def _mean_of_periods(position: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mean_of_periods(position: Array) -> Array:
     """Mean of (periods, joints, samples) over the periods, without missing values; NaN if all are missing."""
     count = np.isfinite(position).sum(axis=0)
-    mean: NDArray[np.float64] = np.where(count > 0, np.nansum(position, axis=0) / np.maximum(count, 1), np.nan)
+    mean: Array = np.where(count > 0, np.nansum(position, axis=0) / np.maximum(count, 1), np.nan)
     return mean
 
 
-def _state_at(samples: NDArray[np.void], row: int, rate: float) -> NDArray[np.float64] | None:
+def _state_at(samples: NDArray[np.void], row: int, rate: float) -> Array | None:
     """Angles and velocities (2, joints) [rad, rad/s] at `row`, from a cubic fitted to nearby readings; None if too many
     are missing.
     """
@@ -112,28 +113,28 @@ def _state_at(samples: NDArray[np.void], row: int, rate: float) -> NDArray[np.fl
     return np.ascontiguousarray(np.transpose(state))
 
 
-def _by_period(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def _by_period(values: Array, count: int) -> Array:
     """Split (joints, samples) into periods of `count` samples: (periods, joints, count)."""
     return np.moveaxis(values.reshape(len(values), -1, count), 1, 0)
 
 
-def _torque_constants(config: Config) -> NDArray[np.float64]:
+def _torque_constants(config: Config) -> Array:
     return np.array([joint.torque_per_goal for joint in config.joints])
 
 
-def _stabilised(config: Config, rows: NDArray[np.void], torque: NDArray[np.float64], first: int) -> Stabilised:
+def _stabilised(config: Config, rows: NDArray[np.void], torque: Array, first: int) -> Stabilised:
     """Separate the stabiliser's part of `torque` (joints, samples) [N m], which starts at row `first`."""
     with_former = rows[first - 1 : first + torque.shape[1]]
     given = np.nan_to_num(feedback_torque(config, with_former)).T
     excitation = _by_period(torque - given, config.experiment.samples).mean(axis=0)
-    position: NDArray[np.float64] = with_former["position"][0]
-    velocity: NDArray[np.float64] = with_former["velocity"][0]
+    position: Array = with_former["position"][0]
+    velocity: Array = with_former["velocity"][0]
     former = np.nan_to_num(np.stack((position, velocity)))
     commanded = with_former["goal_current"][0] * _torque_constants(config)
     return Stabilised(feedback_of(config), np.ascontiguousarray(excitation), former, commanded)
 
 
-def scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def scatter(position: Array) -> Array | None:
     """Standard deviation of the mean over periods for each joint (joints,) [rad], from (periods, joints, samples); None
     for a single period.
     """
@@ -146,11 +147,11 @@ def scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
     # Samples received in only one period, or in none, say nothing about the scatter.
     several = seen > 1
     variance = np.where(several, squares / np.maximum(seen - 1, 1), 0.0).sum(axis=1)
-    std: NDArray[np.float64] = np.sqrt(variance / np.maximum(several.sum(axis=1), 1) / count)
+    std: Array = np.sqrt(variance / np.maximum(several.sum(axis=1), 1) / count)
     return std
 
 
-def _first_settled(position: NDArray[np.float64], within: float) -> int | None:
+def _first_settled(position: Array, within: float) -> int | None:
     """Index of the first period that matches the one before it, by the criterion used while streaming; None if there is
     none.
     """
@@ -160,6 +161,6 @@ def _first_settled(position: NDArray[np.float64], within: float) -> int | None:
     return None
 
 
-def _drifting(position: NDArray[np.float64], within: float, wanted: int) -> int | None:
+def _drifting(position: Array, within: float, wanted: int) -> int | None:
     """Index of the first of the last `wanted` periods if only slow drift remains; otherwise None."""
     return len(position) - wanted if settling_difference(position[-2], position[-1]) <= within else None

@@ -4,15 +4,12 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hil.config.joint import USUAL_TORQUE_SPREAD, JointConfig
 from hil.drivers.servo_model import Mode
+from hil.estimator.arrays import Array
 from hil.estimator.models.conflicts import Conflict
 from hil.results.parts import Quantity
 
-Values = NDArray[np.float64]
 RATIO = "torque_scale"
 USUAL_RATIO_STD = math.hypot(USUAL_TORQUE_SPREAD, USUAL_TORQUE_SPREAD)
 CONTRADICTORY = 2.0  # standard deviations, those of the torque constants and of the ratio combined
@@ -76,7 +73,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
     return f"{found}, known to within {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
 
 
-def ratios_of(names: Sequence[str], value: Values, std: Values) -> dict[str, Quantity]:
+def ratios_of(names: Sequence[str], value: Array, std: Array) -> dict[str, Quantity]:
     """The ratios of the torque constants among the parameters `names`."""
     return {
         name: Quantity(float(each), float(error), "1")
@@ -132,13 +129,11 @@ def _capitalised(sentence: str) -> str:
 
 
 def _ratios(joints: Sequence[str], extra: Mapping[str, Quantity]) -> list[tuple[str, str, Quantity]]:
-    """Joint, parameter and value of each ratio of the torque constants in a result."""
     names = [(joint, f"{RATIO}_{number}") for number, joint in enumerate(joints, 1)]
     return [(joint, name, extra[name]) for joint, name in names if name in extra]
 
 
 def _relative(first: str, ratios: Sequence[tuple[str, Quantity]], source: Source) -> str:
-    """State the ratios, beginning with a lower-case letter."""
     given = ", ".join(f"{joint} gives {ratio.value:.5g} +- {ratio.std:.1g}" for joint, ratio in ratios)
     one = len(ratios) == 1
     if source == "column":

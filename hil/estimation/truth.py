@@ -1,7 +1,6 @@
 """The true parameters of a fake arm, as built and as scaled to the torque constants that a result assumes.
 
-Motion and current determine the parameters only up to the torque constants: a result assumes the file's constants,
-which need not be those of the fake arm's motors.
+A result assumes the file's torque constants, which need not be those of the fake arm's motors.
 """
 
 import math

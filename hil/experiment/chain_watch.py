@@ -1,11 +1,9 @@
 """Check during the experiment that a spatial arm's motion is consistent with some arm of the dry run's ensemble.
 
-Prior knowledge is the ensemble's mean and inflated covariance. The ensemble is drawn around the description, and
-updated after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
-A joint that stands still at its rest angle may lie against an end stop there, for example because it has reached it
-before the other joints. It is therefore judged only by torques towards the side on which it has been. A joint that has
-been on both sides of its rest angle has no stop there. A joint that has not left its rest angle yet may rest against a
-stop on the side to which gravity pulls it: it is judged only while it is commanded to that side.
+Prior knowledge is the ensemble's mean and inflated covariance. While the arm is in its rest pose, something may support
+it, so nothing is judged. A joint that stands still at its rest angle may lie against an end stop there. It is therefore
+judged only by torques towards the side on which it has been. A joint that has not left its rest angle yet may rest
+against a stop on the side to which gravity pulls it: it is judged only while it is commanded to that side.
 """
 
 import math
@@ -13,12 +11,12 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.dry_run.chain_prior import prior_arms
 from hil.errors import Cause, SafetyStop
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.chain.simulation.motion_observer import ChainObserver
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.experiment.checks.apart import causes_of_standstill
@@ -26,8 +24,6 @@ from hil.experiment.checks.consistency import check_standstill
 from hil.experiment.model_watch import UNLIKE_ANY_ARM, Explain
 from hil.plan.chain_model import known_chain
 from hil.plan.obedience import Residual
-
-Array = NDArray[np.float64]
 
 ARMS = 96
 WIDENED = 1.5
@@ -111,7 +107,7 @@ class ChainWatch:
         self._commanded.append((state, torque))
         return self._observer.observe(position, velocity, torque, seconds, is_free, support)
 
-    def _support(self, is_away: NDArray[np.bool_], velocity: Array, torque: Array) -> Array:
+    def _support(self, is_away: Mask, velocity: Array, torque: Array) -> Array:
         """Direction in which a stop may block each joint (joints,): 1, -1, or 0.
 
         is_away: whether each joint is away from its rest angle. torque: commanded (joints,) [N m].

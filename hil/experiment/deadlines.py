@@ -98,7 +98,6 @@ class Deadlines:
             )
 
     def _acted(self, seconds: float) -> str:
-        """Say what the servos' watchdogs did during the gap."""
         if seconds < self._watchdog:
             return ""
         # Whether another program had disarmed them is not known afterwards: cutting torque disarms them too.

@@ -1,14 +1,13 @@
 """Comparison of successive periods sample by sample, which avoids a burst of work at the end of a period.
 
 The measure of difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated during the
-period, so that only a few divisions remain at its end. A single buffer holds the previous period; the latest one
-overwrites it.
+period.
 
 The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same
 sample of the previous period. If they differ by more than `TIMES` times the RMS difference between the two previous
 periods, plus `FLOOR_RAD`, for `LASTING_S`, the joint does not repeat its motion (`unlike`). In the second half of the
-second period, the RMS difference in its first half is used instead, since transients only decay. The last `UNJUDGED_S`
-of a period do not affect the tolerance in the next one: a disturbance that begins there would enlarge it.
+second period, the RMS difference in its first half is used instead, since transients only decay. A disturbance in the
+last `UNJUDGED_S` of a period must not enlarge the tolerance in the next one.
 """
 
 from collections.abc import Callable, Sequence

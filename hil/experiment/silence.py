@@ -1,13 +1,11 @@
 """How long servos have been silent, counting only the time during which this program was listening.
 
-A stalled computer cannot receive replies, so their absence reveals nothing about the servos. The limits of
-missed deadlines (`hil.experiment.deadlines`) apply to such time. Only the time during which this program waited for a
-reply that did not come counts as silence.
+Only the time during which this program waited for a reply that did not come counts as silence; for a stalled computer,
+the limits of missed deadlines (`hil.experiment.deadlines`) apply.
 
 A busy computer also delays received bytes: the kernel passes on the bytes of a serial port in a separate thread, which
 waits for a core like any other program, for 4 to 10 ms at a time. So while this program itself wakes up late, silence
-of all servos may be due to the computer, and the same limits apply. If some servos are heard and one is not, that servo
-is silent.
+of all servos may be due to the computer, and the same limits apply.
 """
 
 from math import inf

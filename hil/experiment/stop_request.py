@@ -5,8 +5,8 @@ torque, the handlers only record the request, and the stream checks for it betwe
 the arm, then cuts torque; a second one cuts torque at once; further ones have no effect. While no servo has torque, a
 signal ends the program at once.
 
-A request stays in effect until the outermost block is left: a request made while torque is being cut also cancels the
-remaining steps of a pilot. Even if the exception is swallowed, no further experiment starts.
+A request stays in effect until the outermost block is left: even if the exception is swallowed, no further experiment
+starts.
 """
 
 import signal
@@ -83,7 +83,6 @@ class StopRequest:
 
     @property
     def count(self) -> int:
-        """Number of signals received."""
         return self._count
 
     def _note(self, number: int, _frame: FrameType | None) -> None:

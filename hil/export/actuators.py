@@ -11,8 +11,7 @@ def add_actuators(root: ET.Element, model: ArmModel | ChainArmModel) -> None:
     """Add actuators controlled by a goal [A, or V in pwm mode]: the gain gives the torque, the bias the offset, and the
     filter the drive's lag. Each actuator has the name of its joint.
 
-    A cable is exported as the joint's own stiffness. A negative stiffness, which a joint cannot have, is part of the
-    bias.
+    A cable is exported as the joint's own stiffness; a negative one is part of the bias.
     """
     actuators = ET.SubElement(root, "actuator")
     units = ", ".join(f"{joint.name} [{joint.goal_unit}]" for joint in model.joints)

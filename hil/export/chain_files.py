@@ -135,7 +135,6 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
 
 
 def _held(found: ChainLinks) -> list[str]:
-    """What a file omits if it does not contain the joints outside the arm."""
     if not found.arm.held:
         return []
     with_links = [joint.link for joint in found.arm.joints if joint.movable]
@@ -162,7 +161,6 @@ def _add_geoms(body: ET.Element, solids: Sequence[Solid]) -> None:
 
 
 def _describe(root: ET.Element, model: ChainArmModel, found: ChainLinks, left: list[str]) -> None:
-    """Add comments at the top of the file: its origin, and what was identified or kept."""
     words = [
         f"Inertias, damping and friction identified by hil {__version__}; everything else is from {found.path.name}.",
         "Link inertias: the dynamically equivalent ones closest to that file's. Only the following "
@@ -184,7 +182,6 @@ def _replace_inertial(link: ET.Element, body: Body) -> None:
 
 
 def _scale_inertial(link: ET.Element, share: float) -> None:
-    """Multiply the described mass and inertia of a link by a number below 1."""
     comment(link, f"{share:g} of the described mass and inertia: the full values would leave nothing for its parent")
     for element in (*link.findall("inertial/mass"), *link.findall("inertial/inertia")):
         for key, value in element.attrib.items():

@@ -73,9 +73,8 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
 def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
     """Separate a link from the parts that its held joints move, such as gripper fingers, which keep their inertia.
 
-    If their described masses leave no physically possible body for the link itself, all of them keep the same fraction
-    of their masses. This fraction is halved until a body is possible; if none is, it is 0. Returns the link's body and
-    that fraction.
+    If their described masses leave no physically possible body for the link itself, they keep a common fraction, halved
+    until a body is possible. Returns the link's body and that fraction.
     """
     share = 1.0
     for _ in range(HALVINGS):
@@ -122,7 +121,6 @@ def _rotor(model: ChainArmModel, number: int) -> float:
 
 
 def _body(link: np.ndarray) -> Body:
-    """Convert a link's ten parameters to mass, centre of mass and inertia about it."""
     mass, centre = float(link[0]), link[1:4] / link[0]
     about = np.zeros((3, 3))
     about[np.triu_indices(3)] = link[4:]

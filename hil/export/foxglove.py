@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hil.export.moving_scene import Array, Block, MovingScene, Rod
+from hil.estimator.arrays import Array
+from hil.export.moving_scene import Block, MovingScene, Rod
 
 TRANSFORMS, SCENE = "foxglove.FrameTransforms", "foxglove.SceneUpdate"
 _LINK, _OBSTACLE = {"r": 0.0, "g": 0.45, "b": 0.7, "a": 1.0}, {"r": 0.54, "g": 0.56, "b": 0.6, "a": 0.5}
@@ -96,7 +97,6 @@ def scene_schema() -> dict[str, Any]:
 
 
 def _cylinder(rod: Rod) -> dict[str, Any]:
-    """The rod as a cylinder along the z axis of its own frame."""
     along = rod.ends[1] - rod.ends[0]
     length = float(np.linalg.norm(along))
     turn, _ = Rotation.align_vectors(along[None] / length, np.array([[0.0, 0.0, 1.0]]))

@@ -9,8 +9,8 @@ is chosen among all dynamically equivalent ones (m mass, c centre, J inertia abo
             includes joint 1's rotor, because with a fixed base the two have the same effect
 
 As in a uniform rod held at its end, m c^2 is 3/4 of each second moment, or more if a rod would be too heavy for
-inertia_1. The centre of link 1 is kept within its length, and the rest of its second moment is J1. This is possible if
-and only if inertia_1 inertia_2 > coupling^2, which all bodies of positive mass obey.
+inertia_1. The centre of link 1 is kept within its length. This is possible if and only if inertia_1 inertia_2 >
+coupling^2, which all bodies of positive mass obey.
 """
 
 import math

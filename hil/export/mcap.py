@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil import __version__
 from hil.errors import ExportError, RunFolderError
+from hil.estimator.arrays import Array
 from hil.export.columns import COLUMN_UNITS
 from hil.export.foxglove import (
     SCENE,
@@ -82,8 +82,8 @@ def _write_scene(writer: Any, source: Recorded, start: int) -> None:
     """Write the arm's shapes once, and its frames for every sample in which all joints were read."""
     scene = moving_scene(source.config)
     samples = source.samples
-    deadline: NDArray[np.float64] = samples["deadline"]
-    position: NDArray[np.float64] = samples["position"]
+    deadline: Array = samples["deadline"]
+    position: Array = samples["position"]
     time = deadline - deadline[0]
     due = np.unique(np.searchsorted(time, np.arange(0.0, float(time[-1]) + 1.0 / _SHOWN_HZ, 1.0 / _SHOWN_HZ)))
     due = due[due < len(samples)]

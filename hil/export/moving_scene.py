@@ -6,15 +6,13 @@ Used by the MCAP export; Foxglove's 3D panel shows the exported messages `FrameT
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hil.clearance.space import Space
 from hil.config.chain import described_arm
 from hil.config.schema import Config
 from hil.description.urdf import rotation_of
-
-Array = NDArray[np.float64]
+from hil.estimator.arrays import Array
 
 WORLD, BASE = "world", "base"
 PLANAR_RADIUS = 0.1

@@ -3,8 +3,7 @@
 The parameters are drawn from a normal distribution with their covariance. One factor common to all torques is also
 drawn, because the torque constant is known far less accurately than anything else. The motion reveals the ratios of the
 joints' constants, so a single factor remains, as uncertain as the best-known joint's constant. The torque per goal [A
-or V] is scaled with it, so that all drawn arms respond equally to the same goals, within the accuracy of the recording.
-The draws are matched so that their mean and covariance are exactly those of the posterior.
+or V] is scaled with it, so that all drawn arms respond equally to the same goals.
 """
 
 from collections.abc import Sequence
@@ -12,17 +11,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.arm_model import ArmModel
 from hil.chain_model import ChainArmModel
 from hil.errors import ExportError, RunFolderError
+from hil.estimator.arrays import Array
 from hil.estimator.models.terms import kind_of
 from hil.export.mjcf import export_mjcf
 from hil.export.source import Source
 from hil.export.urdf import export_urdf
-
-Array = NDArray[np.float64]
 
 FORMATS = {"mjcf": (export_mjcf, "xml"), "urdf": (export_urdf, "urdf")}
 TABLE = "arms.parquet"

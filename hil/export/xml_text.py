@@ -35,6 +35,5 @@ def axis(model: ArmModel) -> str:
 
 
 def to_text(root: ET.Element) -> str:
-    """The document as indented text."""
     ET.indent(root)
     return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"

@@ -1,4 +1,4 @@
-"""Identification in steps: start small, learn from the motion, simulate again, and raise the torque to the limits.
+"""Identification in steps: start small, learn from the motion, and raise the torque to the limits.
 
 belief   arms that could be the real one, updated with the motion of each run
 gains    a stabiliser for arms without a stable rest pose

@@ -2,9 +2,9 @@
 
 Each recorded motion is assimilated by an ensemble smoother with multiple data assimilation (Emerick and Reynolds,
 Computers and Geosciences 55 (2013) 3). Every arm of the ensemble is given the real arm's commands, and is then updated
-towards the measured motion by regressing parameters on motion over the ensemble. This needs no derivatives, no initial
-guess and no motion that separates all parameters: parameters that a motion does not determine keep the prior's spread.
-A joint that did not move is informative too: arms that would have moved are shifted towards more friction.
+towards the measured motion by regressing parameters on motion over the ensemble. Parameters that a motion does not
+determine keep the prior's spread. A joint that did not move is informative too: arms that would have moved are shifted
+towards more friction.
 """
 
 from dataclasses import dataclass, replace
@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.dry_run.ensemble import Ensemble, result_draws, scale_draws, within_range
 from hil.dry_run.prior import base_draws
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
 from hil.estimator.simulation.many_arms import ManyArms
 from hil.pilot.seen import Seen
 from hil.plan.stabiliser import feedback_of
 from hil.results.result import Result
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _FRICTION = ("viscous", "coulomb", "stribeck_rise")
 _FRICTION_CHANGE = 0.1  # relative standard deviation of friction from one day to another
@@ -194,15 +192,15 @@ def prior_belief(config: Config, arms: int, seed: int = 0) -> Belief:
     return _of_draws(supposed, seed)
 
 
-def earlier_belief(config: Config, result: Result, arms: int, seed: int = 0) -> Belief:
+def earlier_belief(config: Config, result: Result, arms: int) -> Belief:
     """Draw the belief from the result of an earlier run on the same arm. Raises ConfigError.
 
     Terms that the result's model lacks are left out. Friction is drawn with a wider spread than its error bars, since
     it varies with temperature.
     """
-    prior = prior_belief(config, arms, seed)
-    random = np.random.default_rng((seed, 10))
-    drawn = result_draws(result, arms, seed=seed)
+    prior = prior_belief(config, arms)
+    random = np.random.default_rng((0, 10))
+    drawn = result_draws(result, arms)
     supposed = dict(prior.fixed)
     draws: dict[str, Array] = {}
     for name in prior.names:
@@ -213,7 +211,7 @@ def earlier_belief(config: Config, result: Result, arms: int, seed: int = 0) -> 
             supposed[name] = result.values.get(name, term_of(name).absent)
         else:
             draws[name] = values
-    belief = _of_draws(draws, seed)
+    belief = _of_draws(draws, 0)
     return replace(belief, fixed=supposed | belief.fixed, learned=1)
 
 

@@ -1,21 +1,17 @@
 """Breakaway of joints that friction holds: torque rises from run to run, and a run ends soon after a joint moves.
 
-A joint that stood still reveals little more than that its friction is larger than the torque. Just above that friction,
-motion grows quickly: on many of the plausible arms even a few percent more torque makes a joint exceed a limit. If
-every run had to be safe over its whole duration, the torque could therefore hardly be raised. Instead, the guard is
-given narrow limits for such joints, and the torque is raised by a constant ratio from run to run, up to the current
-limit. As soon as the joint moves and so reveals its friction, the arm is braked and the run ends.
+Just above a joint's static friction, motion grows quickly: on many of the plausible arms even a few percent more torque
+makes a joint exceed a limit. Therefore the guard is given narrow limits for such joints, and the torque is raised by a
+constant ratio from run to run, up to the current limit. As soon as the joint moves and so reveals its friction, the arm
+is braked and the run ends.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
+from hil.estimator.arrays import Array, Mask
 from hil.pilot.options import PilotOptions
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.chain_prior import prior_arms
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.chain.model.dynamics import TERMS
 from hil.estimator.chain.model.prior import spread_of
 from hil.estimator.chain.simulation.rollout import ChainArms, inertias, is_physical
@@ -20,8 +21,6 @@ from hil.experiment.chain_watch import linear_parameters
 from hil.pilot.chain_gains import ChainGains
 from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
 from hil.runs.recording import Phase
-
-Array = NDArray[np.float64]
 
 DRAWN = 400
 TAUGHT_HZ = 25.0  # rows of the regression per second of recording
@@ -140,8 +139,7 @@ class ChainBelief:
     def _arms(self, linear: Array) -> ChainArms:
         """Arms with these parameters, in units of the commanded torque.
 
-        A linear update may make a light joint implausibly light. Such arms are moved towards the mean, and discarded if
-        that does not help.
+        Arms with an implausibly light joint are moved towards the mean, and discarded if that does not help.
         """
         base, drive = self.arms.base, self.arms.drive.copy()
         n = drive.shape[2]
@@ -160,7 +158,7 @@ class ChainBelief:
         drive[:, 4] = 1.0
         return ChainArms(base, linear[:, : base.count].copy(), drive)
 
-    def _plausible(self, linear: Array, mean: Array) -> NDArray[np.bool_]:
+    def _plausible(self, linear: Array, mean: Array) -> Mask:
         """Whether arms with these parameters have a positive definite mass matrix and no joint that is too light."""
         count, poses = self.arms.base.count, _poses(self.config)
 
@@ -168,7 +166,7 @@ class ChainBelief:
             drives = np.broadcast_to(self.arms.drive[:1], (len(parameters), *self.arms.drive.shape[1:]))
             return ChainArms(self.arms.base, parameters[:, :count], drives)
 
-        good: NDArray[np.bool_] = is_physical(arms_of(np.concatenate((mean[None], linear))), poses)
+        good: Mask = is_physical(arms_of(np.concatenate((mean[None], linear))), poses)
         lightest = _LIGHTER * self.lightest
         if good[0]:
             lightest = np.minimum(lightest, _LIGHTER_THAN_MEAN * inertias(arms_of(mean[None]), poses)[1][0])
@@ -223,7 +221,6 @@ def _rows(arms: ChainArms, config: Config, samples: NDArray[np.void]) -> tuple[A
 
 
 def _filled(position: Array) -> Array:
-    """Fill missing samples by linear interpolation."""
     filled = np.array(position, dtype=np.float64)
     at = np.arange(len(filled))
     for column in filled.T:

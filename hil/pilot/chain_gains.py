@@ -1,23 +1,19 @@
 """Gains of the software spring and damper that hold a spatial arm to its path: as stiff as the sample rate allows.
 
 Both act on a state that is `DELAY_SAMPLES` old. The damper must be weak enough for the lightest joint not to oscillate.
-A delayed spring drives the motion like a negative damper, so at a low rate damping limits the stiffness. The stiffness
-is reduced no further than this requires, since with a softer spring, friction and unknown gravity torques cause
-larger deviations from the path.
+A delayed spring drives the motion like a negative damper, so at a low rate damping limits the stiffness.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config, StabiliserConfig
 from hil.drivers.servo_prior import servo_prior
+from hil.estimator.arrays import Array
 from hil.estimator.chain.simulation.rollout import ChainArms, inertias
 from hil.plan.gains import MOST_DAMPING, MOST_DRIVING, most_damping, most_stiffness
 from hil.plan.stabiliser import DELAY_SAMPLES
-
-Array = NDArray[np.float64]
 
 FREQUENCY, DAMPING_RATIO = 3.0, 0.7
 """Natural frequency [Hz] and damping ratio that the stabiliser gives each joint, unless the sample rate is too low."""
@@ -50,7 +46,6 @@ class ChainGains:
         )
 
     def at(self, rate: float) -> StabiliserConfig:
-        """Return the gains for a rate [Hz]."""
         return StabiliserConfig(stiffness=_rounded(self.stiffness_at(rate)), damping=_rounded(self._damping_at(rate)))
 
     def stiffness_at(self, rate: float) -> Array:

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.clearance.space import Space
 from hil.config.chain import DEFAULT_BAND, POSITION_RESERVE
 from hil.config.schema import Config
 from hil.errors import NoSafeTorque
+from hil.estimator.arrays import Array
 from hil.estimator.chain.excitation.fourier_path import Path
 from hil.estimator.chain.excitation.path_design import Design, PathDesigner, PathLimits
 from hil.estimator.errors import ExcitationError
@@ -16,8 +16,6 @@ from hil.estimator.progress import Tell
 from hil.plan.chain_model import ChainTorque, known_chain, limit_names, torque_limits
 from hil.plan.chain_plan import check_rest_pose, path_plan
 from hil.plan.plan import HELD_OUT, Plan
-
-Array = NDArray[np.float64]
 
 # Highest speed between rest pose and path: the smaller of this [rad/s] and this fraction of velocity_limit.
 RAMP_SPEED = 1.2

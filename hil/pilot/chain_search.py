@@ -56,11 +56,9 @@ class Said:
         self._trying = ""
 
     def trying(self, which: str) -> None:
-        """Record which path and amplitude are simulated next."""
         self._trying = which
 
     def say(self, text: str) -> None:
-        """Pass a message on."""
         self._at = self._now()
         self._say(text)
 

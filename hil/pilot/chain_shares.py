@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config, PriorConfig
 from hil.dry_run.chain_prediction import ChainPrediction, predict_chain, simulated_seconds
@@ -16,6 +15,7 @@ from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import nearest_limit, unsafe
 from hil.dry_run.prediction import GUARDED, QUANTITIES, Prediction
 from hil.errors import NoSafeTorque
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.progress import Tell
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths
@@ -23,8 +23,6 @@ from hil.plan.chain_model import limit_names
 from hil.plan.chain_plan import NoHeadroom
 from hil.plan.plan import Plan
 from hil.setup.session.servo_session import Say
-
-Array = NDArray[np.float64]
 
 SEARCH_ARMS, ARMS = 24, 72
 """Numbers of arms simulated to find a safe share of the amplitude, and to confirm it."""
@@ -90,7 +88,7 @@ class SafeShares:
     designing: Tell | None = None
     trying: Callable[[str], None] | None = None
     simulated: float = 0.0
-    passed: NDArray[np.bool_] | None = None
+    passed: Mask | None = None
     _path: int = 0
 
     @property
@@ -109,8 +107,8 @@ class SafeShares:
         most: largest allowed share; if `shares` begin with a larger one, all of them are scaled down in proportion. On
         other paths, the share that gives the same amplitude is used instead.
 
-        If the safe share is small, other paths with more reserve are designed; of all safe ones, the most informative
-        is kept. If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.
+        If the safe share is small, other paths with more reserve are designed; the most informative safe one is kept.
+        If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.
         """
         self._path = 0
         found, why = self._safe_of_these(config, shares, most)
@@ -189,7 +187,6 @@ class SafeShares:
         return times
 
     def _safe_of_these(self, config: Config, shares: tuple[float, ...], most: float) -> tuple[Found | None, str]:
-        """Find a safe share for the paths of one seed, or explain why there is none."""
         most = min(most, self.cap) if self.cap < 1.0 else most
         found, why, shortage = self._largest(config, _up_to(most, shares))
         reserve = self.paths.reserve
@@ -267,7 +264,6 @@ class SafeShares:
         return paths.designer.worth(paths.designer.scaled(paths.identify, found.share))[0]
 
     def _unsafe_stop(self, config: Config, plan: Plan) -> str:
-        """Explain why a stop would not lower the arm safely; "" if it would."""
         if config.safety.stop == "cut":
             return ""
         self.simulated += STOPPED_SHARE * ARMS * simulated_seconds(plan)
@@ -292,7 +288,6 @@ def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
-    """Suggest changes that may turn a path that was rejected as `unsafe` into a safe one."""
     if not foreseen.is_clear:
         helps = "A rest_pose farther from obstacles, or less restrictive [clearance] settings (floor, boxes, margin)"
         return f"{helps}, if the arm allows it, can help. {_better_known(config)}"

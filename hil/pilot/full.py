@@ -4,13 +4,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
 from hil.dry_run.supply_speed import lowered, within_supply
 from hil.errors import DidNotMove, ExperimentError
 from hil.estimation.settled_estimate import estimate_run
+from hil.estimator.arrays import Array
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Watch
 from hil.pilot.chain_search import identify_chain_in_steps
@@ -20,8 +20,6 @@ from hil.plan.plan import ROLES
 from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
 from hil.setup.session.servo_session import Say, servo_session
-
-Array = NDArray[np.float64]
 
 
 def identify_in_steps(
@@ -53,9 +51,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
     """Play the full run; repeat it with less torque if it exceeded a limit, and with other waves if it did not settle.
 
     Friction may stop an arm in a different place in every period, however long it moves, so each repetition tolerates a
-    larger difference. The fit does not need equal periods, and the verdict says how well they are predicted. A period
-    that differs from the one before also counts as not settled; if this keeps happening, something is wrong with the
-    arm.
+    larger difference. The fit does not need equal periods, and the verdict says how well they are predicted.
     """
     run, say, options = search.run, search.player.say, search.options
     number = unlike = 0

@@ -1,26 +1,24 @@
 """Gains of a software spring and damper for an arm that does not return to its rest pose: horizontal, upright, or with
-so much friction that gravity cannot move a joint. Such a joint drifts, even from one period to the next.
+so much friction that gravity cannot move a joint.
 
 The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction within a radian,
 and soft enough to leave most of the torque to the excitation.
 
-At a low sample rate, the delay of such a spring would drive the joint (`hil.plan.stabiliser`). Then the damper is made
-stronger, as far as the rate allows, and the spring softer, as far as gravity allows.
+At a low sample rate, the delay of such a spring would drive the joint (`hil.plan.stabiliser`). The damper is then made
+stronger and the spring softer, as far as rate and gravity allow.
 """
 
 from typing import NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config, StabiliserConfig
 from hil.drivers.servo_prior import servo_prior
 from hil.errors import ConfigError
+from hil.estimator.arrays import Array, Mask
 from hil.pilot.belief import Belief
 from hil.plan.gains import MOST_DAMPING, most_damping
 from hil.plan.stabiliser import DELAY_SAMPLES
-
-Array = NDArray[np.float64]
 
 _FREQUENCY = 0.7  # Hz, natural frequency of each joint on its own spring
 _DAMPING_RATIO = 0.35
@@ -31,7 +29,7 @@ _DRIVEN = 0.8  # largest share of a joint's damping that the delay of its spring
 _TORQUE_SHARE = 0.35  # largest share of the torque limit at a deflection of 1 rad, beyond what gravity needs
 
 
-def wandering(config: Config, belief: Belief) -> NDArray[np.bool_]:
+def wandering(config: Config, belief: Belief) -> Mask:
     """Joints that need a spring (joints,): all joints of an arm that falls over or lies flat, otherwise those held by
     friction.
     """
@@ -49,7 +47,7 @@ def falls_over(config: Config, belief: Belief) -> bool:
     return bool(config.arm.gravity) and lowest <= 0.0
 
 
-def with_stabiliser(config: Config, belief: Belief, springs: NDArray[np.bool_] | None = None) -> Config:
+def with_stabiliser(config: Config, belief: Belief, springs: Mask | None = None) -> Config:
     """Add gains to a configuration that needs a stabiliser and has none.
 
     springs: joints that get a spring in any case (joints,).
@@ -60,7 +58,7 @@ def with_stabiliser(config: Config, belief: Belief, springs: NDArray[np.bool_] |
     return config.model_copy(update={"stabiliser": proposed(config, belief, at)})
 
 
-def proposed(config: Config, belief: Belief, springs: NDArray[np.bool_]) -> StabiliserConfig:
+def proposed(config: Config, belief: Belief, springs: Mask) -> StabiliserConfig:
     """Gains suitable for the arms of `belief`, 0 for joints without a spring."""
     parameters = belief.parameters
     away = np.max([_pull_away(config, each) for each in parameters], axis=0)

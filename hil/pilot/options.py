@@ -18,9 +18,7 @@ class PilotOptions:
     max_pilots: int = 40
     """Maximum number of pilots; a joint that does not move reaches its current limit in far fewer."""
     certain_share: float = 0.85
-    """Fraction of a limit that a typical arm should reach. If it reaches less, the pilot is still so uncertain about
-    the arm that too much of the range would remain unused.
-    """
+    """Fraction of a limit that a typical arm should reach."""
     certain_share_known: float = 0.68
     """Fraction of a limit that a typical arm should reach if the belief comes from an earlier result, whose uncertainty
     another run would hardly reduce.
@@ -47,9 +45,7 @@ class PilotOptions:
     torque_after_limit: float = 0.85
     """Cap on the torque of later runs, relative to the torque at which a limit was exceeded."""
     torque_after_unsettled: float = 0.85
-    """Cap on the torque of runs after one that never settled, relative to that run's torque. A large motion with little
-    friction may never settle.
-    """
+    """Cap on the torque of runs after one that never settled, relative to that run's torque."""
     torque_over_friction: float = 1.8
     """After a run that never settled, a joint's torque is not lowered if it is at most this multiple of its Coulomb
     friction.
@@ -74,8 +70,7 @@ class PilotOptions:
     falling_share: float = 0.85
     """Fraction of the limits that runs may use on an arm that falls over when it is stopped."""
     min_falling_torque: float = 0.05
-    """Torque that is always allowed for an arm that falls over, as a fraction of what the current limit allows.
-    """
+    """Torque that is always allowed for an arm that falls over, as a fraction of what the current limit allows."""
     start_inside: float = 0.95
     """An arm that a stopped run left beyond its position limits is assumed to start within this fraction of its range,
     measured from the middle.

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude, largest_amplitude, most_torque, with_peaks
@@ -17,6 +16,7 @@ from hil.dry_run.prediction import GUARDED, predict
 from hil.dry_run.supply_speed import lowered, slower
 from hil.dry_run.waves import designed_plan, roomy_plan, roomy_plans
 from hil.errors import ExperimentError, NoSafeTorque
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.excitation.harmonics import harmonics_within
 from hil.estimator.models.parameters import Physics
 from hil.pilot.belief import MOVED_STEPS, Belief, earlier_belief, prior_belief
@@ -27,8 +27,6 @@ from hil.pilot.steps import Played, Player, Step
 from hil.plan.plan import Plan, scaled
 from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
-
-Array = NDArray[np.float64]
 
 DEFAULTS = PilotOptions()
 
@@ -52,7 +50,7 @@ class Search:
     swing: Array | None = None
     """Largest range of motion of each joint so far (joints,) [rad]."""
 
-    springs: NDArray[np.bool_] | None = None
+    springs: Mask | None = None
     """Which joints had a spring in the last run with a stabiliser (joints,); None if there was none."""
     options: PilotOptions = DEFAULTS
     from_earlier: bool = False
@@ -60,7 +58,7 @@ class Search:
     earlier_swing: Array | None = None
     """Range of motion of each joint in the earlier run from which the belief comes (joints,) [rad], if known."""
 
-    fast: NDArray[np.bool_] = field(init=False)
+    fast: Mask = field(init=False)
     """Joints that exceeded their velocity limit in the last run before they had moved (joints,)."""
     calm: Array = field(init=False)
     """Cap on the torque (joints,) [N m], below that of all runs in which a joint exceeded its velocity limit before it
@@ -143,7 +141,7 @@ class Search:
             self.player.say(sentence)
 
     @property
-    def moved(self) -> NDArray[np.bool_]:
+    def moved(self) -> Mask:
         """Which joints have moved in any run so far (joints,)."""
         step = np.array([joint.joint.servo.position_unit for joint in self.config.joints])
         swing = np.zeros(len(step)) if self.swing is None else self.swing
@@ -179,7 +177,6 @@ class Search:
 
     @property
     def _farther(self) -> float:
-        """Largest ratio of the allowed to the observed range of motion among the joints."""
         allowed = np.ptp(np.array([joint.position_limit for joint in self.config.joints]), axis=1)
         swings = [each for each in (self.swing, self.earlier_swing) if each is not None]
         swing = np.max(swings, axis=0) if swings else np.zeros(len(allowed))
@@ -208,8 +205,7 @@ class Search:
                 self._give_up(config, _names(self.config, still))
             self.player.say(" ".join(self._of_still(still)))
 
-    def _of_still(self, still: NDArray[np.bool_]) -> Iterator[str]:
-        """Sentences about joints that have not moved."""
+    def _of_still(self, still: Mask) -> Iterator[str]:
         if self.fast.any():
             yield (
                 f"{_and(_names(self.config, self.fast))} exceeded the velocity limit before moving by {MOVED_STEPS} "
@@ -252,7 +248,7 @@ class Search:
         config = config if falls else self._narrowed(config, risky)
         return config, self._with(config, found.plan, wanted)
 
-    def _narrowed(self, config: Config, at: NDArray[np.bool_]) -> Config:
+    def _narrowed(self, config: Config, at: Mask) -> Config:
         pose = np.array(config.arm.rest_pose) if self.pose is None else self.pose
         return narrowed(config, pose, at, self.options)
 
@@ -279,9 +275,6 @@ class Search:
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
         """Return `found` or, if it leaves much of the range unused, the best amplitude with other waves if that uses
         more.
-
-        Slightly more torque may tip some of the arms over; with other waves, this happens at larger amplitudes or
-        towards the other side.
         """
         options = self.options
         limited = (found.peak_torque >= options.at_limit * most_torque(config)).all() or self.cap is not None
@@ -326,7 +319,7 @@ class Search:
         """Fraction of the limit that a typical arm reaches (joints,)."""
         return np.asarray(np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0))
 
-    def _refuse_velocity_limit(self, fast: NDArray[np.bool_], held: NDArray[np.bool_]) -> NoReturn:
+    def _refuse_velocity_limit(self, fast: Mask, held: Mask) -> NoReturn:
         """Raise ExperimentError because of the velocity limit. fast: joints that exceeded it. held: joints that did not
         move even at full torque.
         """
@@ -359,7 +352,7 @@ class Search:
         )
 
 
-def _names(config: Config, chosen: NDArray[np.bool_]) -> list[str]:
+def _names(config: Config, chosen: Mask) -> list[str]:
     return [joint.name for joint, is_chosen in zip(config.joints, chosen.tolist(), strict=True) if is_chosen]
 
 

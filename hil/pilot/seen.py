@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.estimator.arrays import Array
 from hil.plan.stabiliser import feedback_torque
 from hil.runs.recording import Phase
-
-Array = NDArray[np.float64]
 
 _FEWEST = 40  # smallest useful number of samples
 
@@ -34,11 +33,11 @@ class Seen:
         return swing
 
 
-def seen_of(config: Config, samples: NDArray[np.void], periods: int = 1) -> Seen | None:
-    """Extract the ramp and the first `periods` periods of a recording; None if it is too short."""
+def seen_of(config: Config, samples: NDArray[np.void]) -> Seen | None:
+    """Extract the ramp and the first period of a recording; None if it is too short."""
     before = np.nonzero(samples["phase"] == Phase.REST)[0]
     played = (samples["phase"] == Phase.RAMP_IN) | (samples["phase"] == Phase.PERIODIC)
-    rows = np.nonzero(played & (samples["segment"] == 0) & (samples["period"] < periods))[0]
+    rows = np.nonzero(played & (samples["segment"] == 0) & (samples["period"] < 1))[0]
     if rows.size < _FEWEST or not before.size:
         return None
     constants = np.array([joint.torque_per_goal for joint in config.joints])

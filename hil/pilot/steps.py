@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import GUARDED, QUANTITIES, UNITS, peaks_of
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
+from hil.estimator.arrays import Array
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Watch
 from hil.pilot.belief import MOVED_STEPS
@@ -21,8 +21,6 @@ from hil.results.parts import PlayedStep
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 from hil.setup.session.servo_session import Say
-
-Array = NDArray[np.float64]
 
 _AT_A_LIMIT = (Cause.POSITION, Cause.VELOCITY, Cause.OUT_OF_VOLTAGE)
 
@@ -157,8 +155,7 @@ def tells_of_the_arm(error: ExperimentError) -> bool:
     """Whether the error is informative about the arm, so that another run may follow: limit exceeded, no motion, no
     steady motion, or a period that differs from the one before.
 
-    Errors caused by another program, or by goals that were altered before they reached the servos, are not informative:
-    a further run with less torque or speed would only hide their cause.
+    Errors caused by another program, or by goals that were altered in transit, are not informative.
     """
     if isinstance(error, SafetyStop):
         return not error.overruled and (error.cause in _AT_A_LIMIT or error.cause is Cause.UNLIKE_BEFORE)

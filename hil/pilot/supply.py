@@ -1,8 +1,7 @@
 """The speed up to which the supply can drive the commanded currents, learned from a stop.
 
-Back-EMF rises with speed. If it leaves too little of the supply voltage, a motor carries less current than
-commanded, and the motion no longer determines the arm's parameters. Such a speed is a limit like velocity_limit, even
-if velocity_limit itself is higher.
+Back-EMF rises with speed. If it leaves too little of the supply voltage, a motor carries less current than commanded,
+and the motion no longer determines the arm's parameters.
 """
 
 import math
@@ -12,10 +11,9 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.estimator.arrays import Array
 from hil.experiment.checks.joint_faults import BELOW_VOLTAGE
 from hil.runs.recording import Phase
-
-Array = NDArray[np.float64]
 
 _DRIVEN = (Phase.RAMP_IN, Phase.WARM_UP, Phase.PERIODIC, Phase.RAMP_OUT)
 _LAST_S = 0.25

@@ -1,8 +1,8 @@
 """The first part of a stop, if possible: braking, with a current opposing each joint's velocity.
 
-Braking lasts for a bounded time and stays within the current limits. It ends at once when a reply is missing, a servo
-raises an alert, a deadline is missed, a second signal arrives, or a joint's velocity or positions show that it speeds
-up, as it does if its motor turns the wrong way. Torque is cut afterwards in any case.
+Braking lasts for a bounded time and stays within the current limits. It ends at once when a reply or deadline is
+missed, a servo raises an alert, a second signal arrives, or a joint speeds up, as it does if its motor turns the wrong
+way.
 
 A joint is braked against its reported velocity only as far as the change of its position confirms it
 (`hil.plan.recent_motion`), so that no current acts in the direction of its actual motion.
@@ -18,7 +18,7 @@ from hil.plan.recent_motion import RecentMotion
 FULL_AT = 0.5
 """Fraction of the velocity limit at which the brake uses the full current limit.
 
-A stronger brake hardly stops the arm sooner, and throws it back much farther if the connection is lost during braking.
+A stronger brake hardly stops the arm sooner, and throws it back farther if the connection is lost.
 """
 
 LIGHTEST = 0.5

@@ -3,16 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.chain import base_gravity, described_arm
 from hil.config.schema import Config
+from hil.estimator.arrays import Array
 from hil.estimator.chain.excitation.fourier_path import Path
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.prior import Prior
-
-Array = NDArray[np.float64]
 
 ARMATURE = 0.01  # kg m^2, assumed by the feed-forward for every joint
 ROUGH_FRICTION = 0.02  # of a joint's largest torque, assumed by the feed-forward

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from hil.clearance.space import Space
 from hil.config.schema import Config
 from hil.errors import ConfigError
+from hil.estimator.arrays import Array
 from hil.estimator.chain.excitation.fourier_path import Path, design_path
 from hil.estimator.excitation.multisine import Multisine
 from hil.plan.chain_model import ChainTorque, KnownChain, described_torque, known_chain, torque_limits
 from hil.plan.plan import Plan, Segment, make_plan, plan_with
-
-Array = NDArray[np.float64]
 
 SETTLE_IN = 0.3  # s over which the feed-forward is faded in and out
 TORQUE_SHARE = 0.8  # of a joint's torque limit that a path may use: the rest is for errors of the assumed model
@@ -189,7 +188,6 @@ def _designed(known: KnownChain, config: Config, role: str, seed: int) -> Path:
 
 
 def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
-    """Check that the path leaves the motors headroom for errors in the description."""
     peaks, limits = np.abs(thought.of(path)).max(axis=1), torque_limits(config)
     for joint, peak, most in zip(config.joints, peaks.tolist(), limits.tolist(), strict=True):
         if peak > TORQUE_SHARE * most:

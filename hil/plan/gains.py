@@ -1,11 +1,7 @@
 """Largest stiffness and damping that can hold a joint at a given sample rate without oscillation."""
 
-import numpy as np
-from numpy.typing import NDArray
-
+from hil.estimator.arrays import Array
 from hil.plan.stabiliser import DELAY_SAMPLES
-
-Array = NDArray[np.float64]
 
 MOST_DAMPING = 0.3
 """Largest fraction of a joint's velocity that the damper may remove per sample, with the other joints free. At 1 or

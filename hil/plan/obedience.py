@@ -3,9 +3,8 @@
 While the torque is constant, a reversed motor cannot be distinguished from an external push: either way, the arm moves
 as if an additional torque acted on the joint. The goal of such a joint is therefore removed briefly, while the others
 are held. Unexplained torque that comes from the joint's own motor then falls in proportion to the motor's torque,
-through the same filter; torque from a push does not. A fall that comes earlier or later has another cause, such as a
-push that has just ended, and the joint is tested again. The test is so short that an unpowered joint gains less speed
-from gravity than a reversed motor would give it.
+through the same filter; torque from a push does not. After a fall that comes earlier or later, the joint is tested
+again. The test is so short that an unpowered joint gains less speed from gravity than a reversed motor would give it.
 """
 
 from collections.abc import Sequence
@@ -50,9 +49,7 @@ motor may have become reversed right before that test.
 """
 
 PAUSE_S, PUSHED_PAUSE_S = 0.01, 0.25
-"""Time between two tests of a joint, and the time after a test that showed a push [s]. A push may end, and noise may
-look like one, so the joint is tested again.
-"""
+"""Time between two tests of a joint, and the time after a test that showed a push [s]."""
 
 
 class Residual(NamedTuple):

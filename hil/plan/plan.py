@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.bus import CHECK_S
 from hil.errors import ConfigError
+from hil.estimator.arrays import Array
 from hil.estimator.excitation.multisine import Multisine, design_multisine, detecting_lines, zippered_lines
 from hil.plan.find_torque import how_to_find_torque
 from hil.plan.stabiliser import check_rate
@@ -24,11 +24,11 @@ class Segment:
 
     role: str
     multisine: Multisine
-    period_current: NDArray[np.float64]
+    period_current: Array
     ramp_samples: int
 
     @property
-    def ramp_in(self) -> NDArray[np.float64]:
+    def ramp_in(self) -> Array:
         """Goal currents before the first period (samples, joints) [A]: the end of a period, faded in, so that the first
         period starts at full amplitude.
         """
@@ -37,7 +37,7 @@ class Segment:
         return self._before(count) * fade[:, None]
 
     @property
-    def ramp_out(self) -> NDArray[np.float64]:
+    def ramp_out(self) -> Array:
         """Goal currents after the last period (samples, joints) [A]: the beginning of a period, faded out."""
         count = self.ramp_samples
         fade = 0.5 + 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
@@ -45,18 +45,18 @@ class Segment:
         return self.period_current[index] * fade[:, None]
 
     @property
-    def peak_torque(self) -> NDArray[np.float64]:
+    def peak_torque(self) -> Array:
         """Largest commanded torque (joints,) [N m]."""
-        peaks: NDArray[np.float64] = np.abs(self.multisine.torque).max(axis=1)
+        peaks: Array = np.abs(self.multisine.torque).max(axis=1)
         return peaks
 
     @property
-    def peak_goal(self) -> NDArray[np.float64]:
+    def peak_goal(self) -> Array:
         """Largest goal that is expected to be commanded (joints,) [A, or V under PWM]; NaN counts as zero."""
-        peaks: NDArray[np.float64] = np.nan_to_num(np.abs(self.period_current)).max(axis=0)
+        peaks: Array = np.nan_to_num(np.abs(self.period_current)).max(axis=0)
         return peaks
 
-    def _before(self, count: int) -> NDArray[np.float64]:
+    def _before(self, count: int) -> Array:
         index = np.arange(-count, 0) % len(self.period_current)
         return self.period_current[index]
 
@@ -81,7 +81,6 @@ class Plan:
     """Largest number of samples for lowering a spatial arm after a stop."""
 
     def first_segment(self) -> "Plan":
-        """The plan with only its first multisine."""
         return replace(self, segments=self.segments[:1])
 
     @property
@@ -94,7 +93,6 @@ class Plan:
 
     @property
     def warm_up_samples(self) -> int:
-        """Number of samples of the warm-up."""
         return self.warm_up_periods * len(self.segments[0].period_current)
 
     @property
@@ -104,12 +102,12 @@ class Plan:
         return self.rest_samples + self.warm_up_samples + played
 
 
-def scaled(config: Config, plan: Plan, peak_torque: NDArray[np.float64]) -> Plan:
+def scaled(config: Config, plan: Plan, peak_torque: Array) -> Plan:
     """The same waves scaled to other peak torques (joints,) [N m]."""
     return replace(plan, segments=tuple(_scaled_segment(config, segment, peak_torque) for segment in plan.segments))
 
 
-def _scaled_segment(config: Config, segment: Segment, peak_torque: NDArray[np.float64]) -> Segment:
+def _scaled_segment(config: Config, segment: Segment, peak_torque: Array) -> Segment:
     wave = segment.multisine
     factor = peak_torque / np.abs(wave.torque).max(axis=1)
     amplitudes = tuple(tuple(float(f * a) for a in each) for f, each in zip(factor, wave.amplitudes, strict=True))
@@ -117,11 +115,11 @@ def _scaled_segment(config: Config, segment: Segment, peak_torque: NDArray[np.fl
     return Segment(segment.role, multisine, period_current(config, multisine), segment.ramp_samples)
 
 
-def period_current(config: Config, multisine: Multisine) -> NDArray[np.float64]:
+def period_current(config: Config, multisine: Multisine) -> Array:
     """One period of goal currents (samples, joints) [A], clipped to the limits."""
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     limits = np.array([joint.goal_limit for joint in config.joints])
-    clipped: NDArray[np.float64] = np.clip(multisine.torque.T / constants, -limits, limits)
+    clipped: Array = np.clip(multisine.torque.T / constants, -limits, limits)
     return clipped
 
 
@@ -162,7 +160,6 @@ def _end_samples(config: Config) -> int:
 
 
 def _lines(config: Config) -> Sequence[Sequence[int]]:
-    """The harmonics of each joint, from the configured lines or band."""
     experiment = config.experiment
     if experiment.band is None:
         return experiment.lines or []

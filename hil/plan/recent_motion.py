@@ -1,9 +1,9 @@
 """Range of velocities that each joint's change of position allows: no brake may rely on a reported velocity alone.
 
-A servo can report a false velocity in an intact reply. A brake that trusted it would drive the joint. Therefore the
-velocity to brake against is the reported one, confined to the range that the change of position allows over two spans
-of time: a short one, which soon shows a reversal, and a long one, in which a slow motion is visible despite the
-encoder's steps. Each range includes zero, but excludes the direction opposite to a visible motion.
+A brake that trusted a false velocity would drive the joint. Therefore the velocity to brake against is the reported
+one, confined to the range that the change of position allows over two spans of time: a short one, which soon shows a
+reversal, and a long one, in which a slow motion is visible despite the encoder's steps. Each range includes zero, but
+excludes the direction opposite to a visible motion.
 """
 
 from collections import deque

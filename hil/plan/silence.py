@@ -14,8 +14,8 @@ _ROUNDING_S = 1e-6
 
 
 BRIDGED_S = 0.06
-"""How long servos may fail to reply while an arm is lowered [s]: dropping it would be worse than continuing to drive it
-along the path that it was following. Torque must be off 100 ms after the last reply; switching it off takes some time.
+"""How long servos may fail to reply while an arm is lowered [s]. Torque must be off 100 ms after the last reply;
+switching it off takes some time.
 """
 
 BRIDGED_ALONE_S = 0.028

@@ -1,7 +1,6 @@
 """A software spring and damper for arms without a stable rest pose: horizontal or inverted.
 
-The estimator receives the torque that was actually commanded, including spring and damper; their contribution can be
-recomputed from the recording, because it depends only on the previous sample's position and velocity.
+The estimator receives the torque that was actually commanded, including spring and damper.
 """
 
 import numpy as np
@@ -11,6 +10,7 @@ from hil.config.schema import Config
 from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import ConfigError
+from hil.estimator.arrays import Array
 from hil.estimator.simulation.closed_loop import Feedback
 from hil.results.parts import StabiliserShare
 
@@ -131,10 +131,10 @@ def stabiliser_share(config: Config, samples: NDArray[np.void]) -> StabiliserSha
     )
 
 
-def feedback_torque(config: Config, samples: NDArray[np.void]) -> NDArray[np.float64]:
+def feedback_torque(config: Config, samples: NDArray[np.void]) -> Array:
     """The stabiliser's torque in all rows but the first (rows - 1, joints) [N m]; NaN where a reply is missing."""
     assert config.stabiliser is not None
     stiffness, damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
-    position: NDArray[np.float64] = samples["position"][:-1]
-    velocity: NDArray[np.float64] = samples["velocity"][:-1]
+    position: Array = samples["position"][:-1]
+    velocity: Array = samples["velocity"][:-1]
     return stiffness * (np.array(config.arm.rest_pose) - position) - damping * velocity

@@ -1,19 +1,16 @@
 """Path along which a stop lowers a spatial arm: from any pose to the rest pose, clear of obstacles, in bounded time.
-The path is straight in joint space if that is clear. Otherwise it leads straight to a pose of the planned transition
-from the rest pose, the first one that can be reached clear of obstacles. From there it follows that transition
-backwards, which is known to be clear.
+The path is straight in joint space if that is clear. Otherwise it leads straight to the first reachable pose of the
+planned transition from the rest pose, and follows that transition backwards, which is known to be clear.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.clearance.space import Space
 from hil.config.schema import Config
+from hil.estimator.arrays import Array
 from hil.estimator.chain.excitation.fourier_path import Path
 from hil.plan.chain_plan import SETTLE_IN, PathSegment
 from hil.plan.plan import Plan
-
-Array = NDArray[np.float64]
 
 STATIONS = 16
 """Number of poses of the planned transition at which an arm may join it."""
@@ -22,8 +19,7 @@ PULL_PER_S, PULL_SHARE = 2.0, 0.25
 """Growth rate of an additional torque towards the path, relative to the spring's torque [1/s], and the largest value of
 that torque, relative to the joint's largest torque.
 
-At a low sampling rate the spring must be soft to be stable. On its own, it is then too weak to overcome the friction of
-a light joint, which would stop tenths of a radian from the rest pose.
+At a low sampling rate the spring alone is too weak to overcome the friction of a light joint.
 """
 
 LOOKED_AT = 25  # poses of a straight line that are checked

@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.errors import CsvError
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import LONGEST_GAP, MOST_GAP
 from hil.recordings.encoder import encoder_step
-
-Values = NDArray[np.float64]
 
 FEW = 0.02  # of the rows: share that may be corrected, if reported
 LONGEST_HOLE = 0.05  # s of torque that are filled in
@@ -25,13 +24,12 @@ class Rows:
     correction.
     """
 
-    time: Values
-    torque: Values
-    position: Values
+    time: Array
+    torque: Array
+    position: Array
     notes: tuple[str, ...] = ()
 
-    def kept(self, chosen: NDArray[np.bool_] | NDArray[np.int64] | slice, *notes: str) -> "Rows":
-        """Select rows and append notes."""
+    def kept(self, chosen: Mask | NDArray[np.int64] | slice, *notes: str) -> "Rows":
         chosen_rows = self.time[chosen], self.torque[:, chosen], self.position[:, chosen]
         return Rows(*chosen_rows, (*self.notes, *notes))
 
@@ -139,13 +137,12 @@ def _filled(source: str, rows: Rows, held: bool) -> Rows:
     return Rows(rows.time, torque, rows.position, rows.notes).kept(~out, *notes)
 
 
-def _rows(chosen: NDArray[np.bool_]) -> str:
+def _rows(chosen: Mask) -> str:
     count = int(chosen.sum())
     return f"{count} row" + "s" * (count != 1)
 
 
 def _apart(rows: Rows) -> list[Rows]:
-    """Split the rows at long gaps into separate recordings."""
     step = np.diff(rows.time)
     usual = float(np.median(step)) if step.size else 0.0
     if usual > MOST_GAP:

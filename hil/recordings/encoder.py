@@ -1,16 +1,15 @@
 """Estimation of an encoder's resolution from its readings."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Values = NDArray[np.float64]
+from hil.estimator.arrays import Array
 
 FEWEST = 5  # readings
 MOST_OFF = 0.12  # of a step: largest distance of a reading from a whole step, for values rounded in the file
 MOST_SHARE = 0.7  # of the readings: with a larger share of distinct values, no steps are recognised
 
 
-def encoder_step(position: Values) -> float | None:
+def encoder_step(position: Array) -> float | None:
     """Largest step that divides all differences between readings (samples,), in their unit; None if there is none."""
     finite = position[np.isfinite(position)]
     if finite.size < FEWEST:
@@ -29,7 +28,7 @@ def encoder_step(position: Values) -> float | None:
     return None
 
 
-def _refined(away: Values, step: float) -> float | None:
+def _refined(away: Array, step: float) -> float | None:
     """Refine a step by regression on integers, from near readings to far ones; None if not all are whole steps."""
     reach = 20.0 * step
     while True:

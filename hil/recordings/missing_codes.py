@@ -1,9 +1,8 @@
 """Numbers that stand for missing values, such as -999."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Values = NDArray[np.float64]
+from hil.estimator.arrays import Array
 
 CODES = tuple(
     sign * code for code in (99.0, 999.0, 9999.0, 99999.0, 999999.0, 32767.0, 65535.0) for sign in (-1.0, 1.0)
@@ -15,7 +14,7 @@ APART = 2.0
 """Smallest distance of a code from all other values, relative to their range."""
 
 
-def without_codes(values: Values) -> tuple[Values, float | None]:
+def without_codes(values: Array) -> tuple[Array, float | None]:
     """Replace a code for missing values by NaN; return the values and the code, which is None if there is none.
 
     A number is a code only if it is a usual one, repeats exactly, and lies far from all other values.

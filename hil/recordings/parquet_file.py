@@ -90,7 +90,7 @@ def _flat(name: str, column: Any, feature: dict[str, Any]) -> dict[str, Values]:
 
 
 def _labels(feature: dict[str, Any], size: int) -> list[str]:
-    """Names of a vector's entries; LeRobot stores them as a list, possibly under a key such as "motors"."""
+    """Names of a vector's entries, possibly under a key such as "motors"."""
     names = feature.get("names")
     if isinstance(names, dict):
         names = next((each for each in names.values() if isinstance(each, list)), None)

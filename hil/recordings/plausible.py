@@ -1,19 +1,16 @@
 """Rejection of angles that no servo arm reaches: most often they are in degrees, although the file does not say so.
 
-An estimate from such angles takes minutes and is meaningless. Joints that rotate continuously are accepted, and so is
-everything if [columns] states the unit.
+Joints that rotate continuously are accepted, and so is everything if [columns] states the unit.
 """
 
 import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.drivers.servo_model import fastest_no_load
 from hil.errors import CsvError
-
-Values = NDArray[np.float64]
+from hil.estimator.arrays import Array
 
 MOST_RANGE_RAD = 4 * math.pi
 """Widest plausible range of a joint that moves back and forth [rad]."""
@@ -28,7 +25,7 @@ _OVER_S, _USUAL = 0.02, 0.9
 """Time over which speeds are averaged to suppress noise [s], and the quantile of the speeds that is checked."""
 
 
-def refuse_degrees(source: str, names: Sequence[str], time: Values, position: Values) -> None:
+def refuse_degrees(source: str, names: Sequence[str], time: Array, position: Array) -> None:
     """Raise CsvError if `position` (joints, samples) [rad] is beyond the range of servos.
 
     names: columns of the positions. time: sampling times (samples,) [s].
@@ -55,7 +52,7 @@ def refuse_degrees(source: str, names: Sequence[str], time: Values, position: Va
         )
 
 
-def _speed(time: Values, position: Values) -> float:
+def _speed(time: Array, position: Array) -> float:
     """Speed that a joint seldom exceeds [rad/s]; 0 if the recording is too short to tell."""
     step = np.diff(time)
     usual = float(np.median(step)) if step.size else 0.0

@@ -1,8 +1,7 @@
 """Comparison of recorded velocities with the positions: a wrong time scale leaves no other trace.
 
-Parameters absorb a wrong time scale: if the recorded times are twice the true ones, the estimated inertia is four
-times too large. Only a second measurement that depends on time, such as a velocity column, shows it. Velocities are
-otherwise not used.
+Parameters absorb a wrong time scale: if the recorded times are twice the true ones, the estimated inertia is four times
+too large. Velocities are otherwise not used.
 """
 
 import math
@@ -11,12 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array
 from hil.recordings.table import Table
 from hil.recordings.units import split_head
-
-Values = NDArray[np.float64]
 
 WINDOW = 0.5  # s over which motion is averaged, so that noise and filters of the velocity hardly matter
 FEWEST_WINDOWS = 8
@@ -41,7 +38,7 @@ class Rate:
     late: float
 
 
-def rates(table: Table, time: Values, position: Values) -> tuple[Rate, ...]:
+def rates(table: Table, time: Array, position: Array) -> tuple[Rate, ...]:
     """Compare the velocity columns with `position` (joints, rows) [rad] at `time` (rows,) [s].
 
     Returns () unless there is one such column per joint, and each follows its joint.
@@ -106,7 +103,7 @@ def _columns(table: Table) -> list[str]:
     return named
 
 
-def _rate(column: str, time: Values, position: Values, velocity: Values) -> Rate | None:
+def _rate(column: str, time: Array, position: Array, velocity: Array) -> Rate | None:
     known = np.isfinite(time) & np.isfinite(position) & np.isfinite(velocity)
     time, position, velocity = time[known], position[known], velocity[known]
     if time.size < FEWEST_WINDOWS or np.any(np.diff(time) <= 0.0) or time[-1] - time[0] < FEWEST_WINDOWS * WINDOW:
@@ -130,7 +127,7 @@ def _rate(column: str, time: Values, position: Values, velocity: Values) -> Rate
     return Rate(column, factor, float(lags[best])) if alike[best] > 0.0 else None
 
 
-def _increase(at: Values, time: Values, values: Values) -> Values:
+def _increase(at: Array, time: Array, values: Array) -> Array:
     """Increase of `values` over a window around each time, averaged over shifts of up to half the window's length."""
     fine = np.linspace(-0.5 * WINDOW, 0.5 * WINDOW, 9)
     mean = sum(

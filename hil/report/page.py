@@ -74,7 +74,6 @@ def write_page(page: str, path: Path) -> None:
 
 
 def make_page(data: RunData) -> str:
-    """The whole HTML document."""
     return render(Path(data.record.config).stem, data.record.started, sections(data))
 
 
@@ -119,6 +118,5 @@ def _share_of_points(shown: Sequence[Section]) -> float:
 
 
 def _draw(figure: Figure, share: float) -> Markup:
-    """Draw both widths; the style sheet shows the one that fits."""
     sizes = (replace(size, points=max(FEWEST_POINTS, int(share * size.points))) for size in (WIDE, NARROW))
     return Markup("".join(draw_svg(figure, size) for size in sizes))

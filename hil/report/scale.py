@@ -4,7 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from hil.estimator.arrays import Array
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -20,7 +21,7 @@ class Scale:
     log: bool = False
     spacing: float = 70  # approximate px between ticks
 
-    def pixels(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def pixels(self, values: Array) -> Array:
         """Pixel coordinates of data (n,)."""
         low, high = self._ends
         shown = np.log10(np.maximum(values, 1e-300)) if self.log else values
@@ -44,7 +45,7 @@ class Scale:
         return (math.log10(self.low), math.log10(self.high)) if self.log else (self.low, self.high)
 
 
-def span(values: NDArray[np.float64], log: bool, margin: float) -> tuple[float, float]:
+def span(values: Array, log: bool, margin: float) -> tuple[float, float]:
     """Axis limits that contain all finite values with a margin; a default range if there are none."""
     finite = values[np.isfinite(values) & (values > 0)] if log else values[np.isfinite(values)]
     if not finite.size:

@@ -6,14 +6,12 @@ The page's scripts place the links themselves, so that a motion of minutes takes
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.clearance.space import Space
 from hil.config.schema import Config
 from hil.description.urdf import rotation_of
+from hil.estimator.arrays import Array, Mask
 from hil.report.section import Motion, SpatialMotion
-
-Array = NDArray[np.float64]
 
 MOST_FRAMES = 600
 FEW_POSES = 60
@@ -68,11 +66,10 @@ def spatial_motion(
 
 
 def _frame_step(position: Array) -> int:
-    """Number of samples from one frame to the next."""
     return max(1, -(-int(position.shape[1]) // MOST_FRAMES))
 
 
-def _clearances(space: Space, angles: Array, on_the_way: NDArray[np.bool_]) -> dict[str, Any]:
+def _clearances(space: Space, angles: Array, on_the_way: Mask) -> dict[str, Any]:
     """Smallest clearance of each frame [mm], excess over the required one [mm], and index of the pair in `pairs`."""
     pairs: dict[tuple[str, str], int] = {}
     clearance, room, nearest = [], [], []

@@ -7,7 +7,8 @@ from html import escape
 
 import numpy as np
 
-from hil.report.chart import Array, Chart, Figure, Series, thin
+from hil.estimator.arrays import Array
+from hil.report.chart import Chart, Figure, Series, thin
 from hil.report.matrix_svg import draw_matrix
 from hil.report.scale import Scale, label, span
 
@@ -133,7 +134,6 @@ def _y_axis(chart: Chart, x: Scale, y: Scale, size: Size) -> str:
 
 
 def _legend(series: tuple[Series, ...], width: float) -> tuple[str, int]:
-    """The legend above the chart and its number of rows."""
     named = [one for one in series if one.name]
     across, row, parts = 58.0, 0, []
     for one in named:

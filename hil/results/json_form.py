@@ -2,7 +2,7 @@
 
 A field is stored under its own name, or under the name in its metadata entry "key". A field with False in its metadata
 entry "json" is not stored. An optional field whose default is None is omitted while it is None. Unknown keys are
-ignored when reading: they come from a newer version.
+ignored when reading.
 
 JSON has no infinity and no NaN: they are written as null, which is read as NaN, or as infinity in a `Spread`.
 """

@@ -1,9 +1,8 @@
 """Run work that may block in a separate thread: files, terminals, callbacks.
 
-While servos have torque, the control loop must not wait for a disk or a terminal: a terminal stopped with Ctrl-S or a
-file on a disconnected network drive can block a write indefinitely, and Python handles no signal in the meantime.
-Therefore the control loop only puts items into a bounded queue, which never blocks; items that do not fit are dropped
-and counted.
+A terminal stopped with Ctrl-S or a file on a disconnected network drive can block a write indefinitely, and Python
+handles no signal in the meantime. Therefore the control loop only puts items into a bounded queue; items that do not
+fit are dropped and counted.
 """
 
 import threading

@@ -1,7 +1,7 @@
 """period.npz: each multisine's settled period as measured and as predicted, for figures and other tools.
 
 Arrays are named ROLE_torque, ROLE_position, ROLE_predicted, ROLE_rate. ROLE is "identify" for the fitted multisine, and
-"held_out" for the one that was not fitted: it is predicted from the state one period earlier, or from rest.
+"held_out" for the one predicted from the state one period earlier, or from rest.
 """
 
 from collections.abc import Mapping
@@ -10,9 +10,9 @@ from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.errors import RunFolderError
+from hil.estimator.arrays import Array
 from hil.estimator.data.relative_error import relative_error
 from hil.runs.file_size import check_archive
 
@@ -29,21 +29,21 @@ class PlayedPeriod:
     """
 
     rate: float
-    torque: NDArray[np.float64]
-    position: NDArray[np.float64]
-    predicted: NDArray[np.float64]
+    torque: Array
+    position: Array
+    predicted: Array
 
     @property
-    def error(self) -> NDArray[np.float64]:
+    def error(self) -> Array:
         """Measured minus predicted position (joints, samples) [rad]."""
         return np.asarray(self.position - self.predicted)
 
     @property
-    def relative_error(self) -> NDArray[np.float64]:
+    def relative_error(self) -> Array:
         """RMS prediction error, encoder noise included, relative to the RMS of the motion about its mean (joints,)."""
         return relative_error(self.position, self.predicted)
 
-    def error_beyond(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    def error_beyond(self, noise: Array) -> Array:
         """Like `relative_error`, but excluding the encoders' `noise` (joints,) [rad], which no model can predict."""
         return relative_error(self.position, self.predicted, noise)
 

@@ -1,7 +1,6 @@
 """Samples written to disk as they are taken: a preallocated, memory-mapped `.npy` of a structured type.
 
-The samples survive if the process is killed, but not if the machine loses power before the kernel has written the
-pages. A row whose phase is 0 has not been recorded.
+The samples survive if the process is killed. A row whose phase is 0 has not been recorded.
 """
 
 import contextlib
@@ -117,7 +116,6 @@ class Recorder:
 
     @property
     def samples(self) -> NDArray[np.void]:
-        """The rows recorded so far."""
         return self._samples[: self.count]
 
     def keep(self, deadline: float, phase: Phase, segment: int, period: int, state: State) -> None:

@@ -17,10 +17,10 @@ from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil import __version__
 from hil.errors import RunFolderError
+from hil.estimator.arrays import Array
 from hil.results.json_form import FormError, from_json, to_json
 from hil.runs.file_size import check_archive
 from hil.runs.run_folder import SCHEMA, taken, write_json
@@ -65,10 +65,10 @@ class Predicted:
     """
 
     name: str
-    time: NDArray[np.float64]
-    torque: NDArray[np.float64]
-    position: NDArray[np.float64]
-    predicted: NDArray[np.float64]
+    time: Array
+    torque: Array
+    position: Array
+    predicted: Array
 
 
 def describe(config: str, files: Sequence[Path], notes: Sequence[str]) -> RecordingRecord:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array
 from hil.results.parts import Quantiles, StreamTiming
 
 SERVO_CLOCK_WRAP_S = 32.768
@@ -64,26 +65,25 @@ def lost_samples(samples: NDArray[np.void], names: Sequence[str]) -> str:
 
 
 def _sent(samples: NDArray[np.void]) -> NDArray[np.void]:
-    """The samples whose deadline was not missed."""
     sent: NDArray[np.void] = samples[_round_trip(samples) > 0.0]
     return sent
 
 
-def _round_trip(samples: NDArray[np.void]) -> NDArray[np.float64]:
+def _round_trip(samples: NDArray[np.void]) -> Array:
     """From write to reply, in the shape of `samples` [s]; 0 where nothing was written."""
-    before: NDArray[np.float64] = samples["time_before_write"]
-    after: NDArray[np.float64] = samples["time_after_read"]
+    before: Array = samples["time_before_write"]
+    after: Array = samples["time_after_read"]
     return after - before
 
 
-def _lateness_us(sent: NDArray[np.void]) -> NDArray[np.float64]:
+def _lateness_us(sent: NDArray[np.void]) -> Array:
     # A virtual clock does not advance during computation, so rounding errors may have either sign.
-    written: NDArray[np.float64] = sent["time_before_write"]
-    deadline: NDArray[np.float64] = sent["deadline"]
+    written: Array = sent["time_before_write"]
+    deadline: Array = sent["deadline"]
     return np.maximum(0.0, 1e6 * (written - deadline))
 
 
-def _quantiles(values: NDArray[np.float64]) -> Quantiles:
+def _quantiles(values: Array) -> Quantiles:
     numbers = (*np.quantile(values, [0.5, 0.99, 0.999]), values.max())
     return Quantiles(*(round(float(value), 1) for value in numbers))
 

@@ -1,14 +1,12 @@
 """Compare the arm with its description: each joint in turn is moved by hand, with torque off, and its angle is read.
 
-An identification cannot detect wrong IDs, directions, zeros or axes: it merely finds wrong parameters for a spatial
-arm. A person who moves the joints notices such errors at once.
+An identification of a spatial arm cannot detect wrong IDs, directions, zeros or axes.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.chain import base_up, described_arm
 from hil.config.joint import JointConfig
@@ -16,6 +14,7 @@ from hil.config.schema import Config
 from hil.description.motion import end_point, moves
 from hil.drivers.clock import Clock
 from hil.drivers.joint import Joint
+from hil.estimator.arrays import Array
 from hil.rest_pose_hint import within_limits
 
 MOVED = 0.15  # rad: a joint that has been moved by hand
@@ -24,7 +23,6 @@ STILL_S = 0.6
 POLL_S = 0.05
 PATIENCE_S = 60.0
 SEVERAL = 0.4  # of the largest motion: what another joint may move along with it
-Array = NDArray[np.float64]
 Read = Callable[[], tuple[float, ...]]
 ReadDrives = Callable[[Joint], tuple[float, ...]]
 
@@ -56,8 +54,7 @@ class Moved:
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
     """Return the pose of the arm at these joint angles [rad].
 
-    An angle may be wrong by whole turns, since a servo does not count turns while it is off. They are removed if the
-    position limits reveal them.
+    Whole turns, which a servo does not count while it is off, are removed if the position limits reveal them.
     """
     limits = [joint.position_limit for joint in config.joints]
     angles = tuple(within_limits(*each) for each in zip(angles, limits, strict=True))
@@ -121,7 +118,6 @@ def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Arr
 
 
 def _reversed(joint: JointConfig) -> list[int] | int:
-    """Return the entry `direction` with every sign reversed."""
     reverse = [-sign for sign in joint.directions]
     return reverse if len(reverse) > 1 else reverse[0]
 

@@ -78,7 +78,6 @@ def usual_length(model: str) -> float:
 
 
 def arm_toml(arm: ArmAnswers) -> str:
-    """Return the text of the TOML file."""
     rate = _rate(arm) if arm.measured is None else arm.measured.rate
     head = [f"# {line}" for line in arm.head.splitlines()]
     port = ["[port]", f"url = {json.dumps(arm.url)}", f"baud = {arm.baud}", *_exchange(arm)]

@@ -167,7 +167,6 @@ def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
 
 
 def _stance(ask: Ask, say: Say) -> str:
-    """Ask for the orientation of the arm."""
     question = "Is the arm hanging (it comes to rest by itself), upright (it would fall over) or flat (horizontal)"
     while True:
         answer = ask(question, HANGING).lower()

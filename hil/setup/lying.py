@@ -63,9 +63,8 @@ def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
 def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float]) -> str:
     """Return a message about a spatial arm that has moved out of its rest pose since torque was cut.
 
-    The message says how far each joint has moved and which rest pose to configure. It is "" if the arm has not moved,
-    was not in its rest pose, or does not answer. before: pose when torque was cut (joints,) [rad]. Raises BusShared if
-    another program switches torque on in the meantime.
+    It is "" if the arm has not moved, was not in its rest pose, or does not answer. before: pose when torque was cut
+    (joints,) [rad]. Raises BusShared if another program switches torque on in the meantime.
     """
     at, rest = np.array(before), np.array(config.arm.rest_pose)
     if not config.is_chain or not np.abs(at - rest).max() < FROM_REST_RAD:

@@ -44,7 +44,7 @@ class Granted(NamedTuple):
 def real_time() -> Iterator[list[Granted]]:
     """Request all settings. Yields the list of settings and whether each was granted.
 
-    Slow requests come first: with raised priority they would delay a second control loop on this computer.
+    Slow requests come first, before the priority is raised.
     """
     with ExitStack() as undo:
         yield [step(undo) for step in (_no_collection, _lock_memory, _timer_slack, _short_turns, _fifo, _own_core)]

@@ -22,8 +22,8 @@ _PATIENCE_S = _SLOT_S * (MAX_ID + 1)
 _STATUS_BYTES = 14
 
 _DIFFERENT = ("Present Position", "Realtime Tick")
-"""Registers that differ between any two servos. Two servos with the same ID answer at once: equal replies, as to a
-ping, merge into one, but different replies corrupt each other.
+"""Registers that differ between any two servos. Of two servos with the same ID, equal replies merge into one, but
+different ones corrupt each other.
 """
 
 
@@ -104,7 +104,6 @@ def _set_to(port: Port, servos: Sequence[Found]) -> int:
 
 
 def _with_more(behind_s: float, watch: Watch) -> Watch:
-    """Wrap the callback so that the remaining time includes the other baud rates."""
     return lambda asking: watch(asking._replace(left_s=asking.left_s + behind_s))
 
 

@@ -1,7 +1,7 @@
 """Check that, until torque is switched on, the arm stays in the pose in which it was first read.
 
-Without torque, only a hand or gravity can move the arm. Any other change of its reported angles means that they are no
-longer correct: a horn has slipped, another servo answers, or another program has changed Homing Offset.
+A change of its reported angles means that they are no longer correct: a horn has slipped, another servo answers, or
+another program has changed Homing Offset.
 """
 
 import math

@@ -88,7 +88,6 @@ def _folder_bytes(config: Config) -> int:
 
 
 def _existing(path: Path) -> Path:
-    """The nearest existing parent folder."""
     for place in (path.absolute(), *path.absolute().parents):
         if place.exists():
             return place

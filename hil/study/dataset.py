@@ -107,7 +107,7 @@ def _read(path: Path, columns: list[str] | None = None) -> pa.Table:
 
 
 def _table(rows: Iterable[Row]) -> pa.Table:
-    """Make a table with columns in order of appearance; mixtures of integers and floats become doubles, others text."""
+    """Make a table with columns in order of appearance."""
     rows = list(rows)
     names = list(dict.fromkeys(name for row in rows for name in row))
     return pa.table({name: _column([row.get(name) for row in rows], name) for name in names})

@@ -39,8 +39,8 @@ _ADDRESS = re.compile(r"([a-z]+://)?[^\s/]+:\d{1,5}")
 _PACKAGES = ("numpy", "scipy", "numba", "distributed")
 _CONNECT_S = 10.0
 _MOST_DEATHS = 10
-"""Number of worker losses during one run after which it counts as failed: a machine may reboot several times, but a run
-that needs too much memory kills every worker that tries it."""
+"""Number of worker losses during one run after which it counts as failed, since a run that needs too much memory kills
+every worker that tries it."""
 
 
 @contextmanager
@@ -72,7 +72,6 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
 
 
 def _silence() -> None:
-    """Keep Dask's own log off the terminal: the caller reports what went wrong."""
     silent = ("distributed", "tornado", "asyncio")
     for name in [each for each in logging.root.manager.loggerDict if each.split(".")[0] in silent]:
         logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -54,7 +54,6 @@ def _first_stop(error: BaseException | None) -> SafetyStop | None:
 
 
 def _seen(config: Config, path: Path) -> dict[str, Any]:
-    """Figures from the recording, if one was started."""
     samples = load_samples(path, len(config.joints)) if path.exists() else None
     if samples is None or not len(samples):
         return {"samples": 0, "stopped_after_s": None, "beyond_limit_rad": 0.0}

@@ -93,7 +93,6 @@ def specifications(study: Study, out: Path, numbers: list[int]) -> Iterator[Spec
 def _work_through(
     client: "Client", study: Study, out: Path, numbers: list[int], dataset: Dataset, runs: int, watch: Watch
 ) -> None:
-    """Write the rows as they arrive; rows received are written even after an error."""
     specs = ((spec.run, spec) for spec in specifications(study, out, numbers))
     rows: list[Row] = []
     done, failed, began, written = runs - len(numbers), _failed(dataset), time.monotonic(), time.monotonic()

@@ -3,11 +3,10 @@
 The arm is driven with the torque that an approximate model requires for the path, plus that of a software spring and
 damper. The series is optimised for the intended use of the result: predicting the torque of other motions in the same
 range. The criterion is evaluated for the worst joint and covers all unknowns of the regression, including friction and
-offsets. If a joint moves little, its gravity torque cannot be distinguished from an offset; a criterion on inertial
-parameters alone would miss this.
+offsets.
 
-This designer is for a box of angles and speeds that the user has chosen ([joint_path]); nothing else limits the path.
-To find the box itself, within limits of torque and clearance, use `path_design`.
+This designer is for a box of angles and speeds that the user has chosen ([joint_path]); `path_design` finds the box
+itself, within limits of torque and clearance.
 """
 
 from dataclasses import dataclass

@@ -2,15 +2,14 @@
 
 The search is an evolution strategy (a mean that moves towards the better half of random variations, N. Hansen and A.
 Ostermeier, Evolutionary Computation 9 (2001) 159, with a single step size) over the coefficients of the finite Fourier
-series of `hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation is
-scaled to the limits of position and speed and then shrunk until `allowed` accepts it.
+series of `hil.estimator.chain.excitation.fourier_path`. Every variation is scaled to the limits of position and speed
+and then shrunk until `allowed` accepts it.
 
-Friction, too, is treated as unknown, and its model as no more accurate than that of the links. If it were known, slow,
-creeping motion would seem to identify a light joint, whose torque is mostly friction.
+Friction, too, is treated as unknown. If it were known, slow, creeping motion would seem to identify a light joint,
+whose torque is mostly friction.
 
 This designer is for the pilot experiment, where only limits are known: it also chooses the centre and width of the
-motion. For a box that the user has chosen, `fourier_path.design_path` is simpler; its criterion, the prediction of
-other motions, requires a given box.
+motion. For a given box, use `fourier_path.design_path`.
 """
 
 from collections.abc import Callable
@@ -110,19 +109,19 @@ class PathDesigner:
             raise ExcitationError("no path about this centre stays within the torque and clearance limits")
         return found
 
-    def design(self, seed: int, generations: int = GENERATIONS, tell: Tell | None = None) -> Design:
+    def design(self, seed: int, tell: Tell | None = None) -> Design:
         """Return the best path found; raises ExcitationError if none is allowed.
 
         tell: called with the number of steps done and the total.
         """
         random = np.random.default_rng(seed)
-        told = counted(tell, CENTRES + generations)
+        told = counted(tell, CENTRES + GENERATIONS)
         centre, lines = self._start(random, told)
         mean = np.concatenate((self._shares_of(centre), lines.real.reshape(-1), lines.imag.reshape(-1)))
         score = self._score(mean)
         best, step = mean, FIRST_STEP
         scale = np.concatenate((np.full(self._joints, 0.15), np.full(mean.size - self._joints, 1.0)))
-        for _ in range(generations):
+        for _ in range(GENERATIONS):
             normal = random.standard_normal((OFFSPRING, mean.size))
             offspring = mean + step * scale * normal
             scores = np.array([self._score(each) for each in offspring])
@@ -175,14 +174,14 @@ class PathDesigner:
             )
         return best[1], best[2]
 
-    def widest(self, centre: Array, seed: int, tries: int = WIDEST_OF) -> Design:
+    def widest(self, centre: Array, seed: int) -> Design:
         """Return, out of several random paths about a centre, the one whose least-moving joint moves farthest.
 
         It is used for validation, which cannot resolve prediction errors below encoder rounding and therefore needs a
         wide motion. Raises ExcitationError if no path is allowed.
         """
         random = np.random.default_rng(seed)
-        found = [self._finished(centre, self._random_lines(random)) for _ in range(tries)]
+        found = [self._finished(centre, self._random_lines(random)) for _ in range(WIDEST_OF)]
         allowed = [design for design in found if design is not None]
         if not allowed:
             raise ExcitationError("no path about this centre stays within the torque and clearance limits")

@@ -45,8 +45,7 @@ SHAPES = {
 }
 """Priors on the shape of friction and on drives: typical value [in its unit] and standard deviation of its logarithm.
 
-Without them, these parameters would be undetermined for a joint that never moves slowly, or has little inertia. Early
-in a fit they are held fixed: a lag that is driven to zero while other errors dominate would hardly recover.
+Early in a fit they are held fixed: a lag that is driven to zero while other errors dominate would hardly recover.
 """
 ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
 """Priors on small angles that gravity may not reveal: standard deviations around zero [rad]."""
@@ -79,10 +78,9 @@ class ChainCoordinates:
     def moved(self, x: Array, step: Array) -> Array:
         """Return the point reached by `step` from `x`; both arrays may end with other coordinates.
 
-        If a recording barely constrains the torque of some joints relative to that of the first, their torque scales
-        and all parameters of their links can change by a common factor. The scales are exponentials of their
-        coordinates. Unless the parameters change exponentially with them, a step does not follow this common change,
-        and only tiny steps reduce the sum of squares.
+        If a recording barely constrains the torque scales of some joints, these and all parameters of their links can
+        change by a common factor. Unless the parameters change exponentially like the scales, a step does not follow
+        this common change, and only tiny steps reduce the sum of squares.
         """
         y = x + step
         if self.torque_scales.size:

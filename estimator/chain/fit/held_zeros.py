@@ -1,4 +1,4 @@
-"""Score test of encoder zeros that a fit held fixed; no further fit is needed.
+"""Score test of encoder zeros that a fit held fixed.
 
 The sum of squares is evaluated once more at the minimum, with the zeros among its coordinates. One step of its normal
 equations estimates the zeros and how much fitting them would lower the sum (Rao's score test).

@@ -2,8 +2,8 @@
 
 An observer keeps the simulation close to the measured angles, even for an arm that is unstable without feedback: each
 position is predicted from past measurements and the model (the prediction error method; Ljung, System Identification,
-2nd ed. 1999, chapter 7). Its gains are chosen by the estimator, regardless of the feedback the robot had. Stiff gains
-follow any motion but carry little information; soft gains carry nearly as much as an open-loop simulation.
+2nd ed. 1999, chapter 7). Stiff gains follow any motion but carry little information; soft gains carry nearly as much as
+an open-loop simulation.
 """
 
 from collections.abc import Iterator
@@ -83,7 +83,6 @@ class ChainProblem:
 
     @property
     def count(self) -> int:
-        """Number of parameters."""
         return len(self.coordinates.names)
 
     def parameters(self, x: Array) -> dict[str, float]:
@@ -162,7 +161,6 @@ class ChainProblem:
         return Quadratic(cost, normal, gradient)
 
     def _of_data(self, x: Array) -> Quadratic:
-        """Return the data's part of the sum of squares at `x`."""
         parameters = self.parameters(x)
         normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
         if not all(map(np.isfinite, parameters.values())):

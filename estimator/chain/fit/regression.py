@@ -1,9 +1,8 @@
 """Filtered inverse dynamics for chains, the classical method: linear least squares on any recording.
 
 The regressor is evaluated on filtered, differentiated positions and then filtered like the torques (Gautier, Janot,
-Vandanjon, IEEE Transactions on Control Systems Technology 21 (2013) 428). No simulation is needed, so measured torques
-can be used as well as commanded ones. With quantised positions, the result is biased and much less accurate than stage
-2.
+Vandanjon, IEEE Transactions on Control Systems Technology 21 (2013) 428). Measured torques can be used as well as
+commanded ones. With quantised positions, the result is biased and much less accurate than stage 2.
 """
 
 from collections.abc import Sequence

@@ -15,7 +15,6 @@ def remaining(minimum: Minimum, coordinates: ChainCoordinates) -> tuple[Array, f
     """Return the undamped step from `minimum` (coordinates,) and the decrease that the normal equations predict for it.
 
     If the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
-    A friction width at its lower bound stays there, and no positive parameter becomes negative.
     """
     at, least = minimum.at, np.full(minimum.x.size, -np.inf)
     # To first order, a decrease of a logarithm by 1 takes the parameter to 0.

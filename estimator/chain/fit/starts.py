@@ -1,13 +1,11 @@
 """Start of stage 2 for chains: from stage 1's result to a rough minimum with a soft observer.
 
-The observer starts stiff, so that the simulation can follow the motion with stage 1's parameters, and is softened as
-the fit improves.
+The observer starts stiff, so that stage 1's parameters suffice to follow the motion, and is softened as the fit
+improves.
 
-If joints often stick, stage 1's estimate of friction can be far off. So can the link parameters and torque scales,
-which are correlated with friction. Softening the observer while the shape of friction is fixed then leads the fit into
-a curved valley, where it stops short of another minimum. So if the soft observer does not explain the motion, a second
-fit starts from the prior's links, with the shape of friction free as soon as the stiffest observer follows the motion.
-The better of the two fits is continued.
+If joints often stick, stage 1's estimate of friction can be far off. Softening the observer while the shape of friction
+is fixed then leads the fit into a curved valley. So if the soft observer does not explain the motion, a second fit
+starts from the prior's links, with the shape of friction free as soon as the stiffest observer follows the motion.
 """
 
 import math
@@ -62,8 +60,7 @@ def first_problem(
 def initial_lag(delay: float, options: ChainOptions) -> float:
     """Return the initial guess of the lag [s]: the geometric mean of stage 1's delay and the typical lag.
 
-    Stage 1's delay is too long by several milliseconds, since it also compensates for the shape of friction near
-    standstill.
+    Stage 1's delay is too long by several milliseconds.
     """
     least = options.min_initial_lag
     return max(math.sqrt(max(delay, least) * SHAPES["lag"][0]), least)
@@ -78,8 +75,8 @@ def repeated(period: SettledPeriod) -> Array:
     """Return the weight of each sample (joints, samples), less than 1 for a sample that shares its neighbours' error.
 
     While a joint sticks, its encoder repeats one reading with one rounding error. Counted at every sample, that error
-    would make the simulated joint creep towards the reading, through friction that is smoothed near standstill.
-    Therefore any number of equal readings in a row counts as at most REPEATED readings.
+    would make the simulated joint creep towards the reading. Therefore any number of equal readings in a row counts as
+    at most REPEATED readings.
     """
     weight = np.ones_like(period.position)
     for row, position in zip(weight, period.position, strict=True):

@@ -5,8 +5,8 @@ the order first moments, inertias, rotor, mass. A column that depends linearly o
 its parameter is lumped into theirs (Gautier, Journal of Robotic Systems 8 (1991) 485). In this order the sums stay
 short, such as `moment_x_3 + 0.124 mass_4`, since a link's mass acts like a moment of the previous link.
 
-Columns that are nearly dependent are considered after all others, the least dependent first. Otherwise, with an axis a
-degree off its link's y axis, the moment along y would be kept, and the sums would have large terms that nearly cancel.
+Columns that are nearly dependent are considered after all others, the least dependent first. Otherwise, the sums would
+have large terms that nearly cancel.
 """
 
 from dataclasses import dataclass, replace
@@ -31,8 +31,8 @@ The norm is relative to the largest column of the same link and kind.
 INDEPENDENT = 2e-3
 """A column is kept in the end if its unexplained part, as in CLEARLY_INDEPENDENT, has a norm above this value.
 
-Rounded angles such as 1.57 or 1.5708 in a description make every parameter slightly independent. They change no torque
-by more than this fraction of the parameter's contribution, so no recording would determine such a parameter.
+Rounded angles such as 1.57 or 1.5708 in a description make every parameter slightly independent. No recording would
+determine such a parameter.
 """
 LEAST_FACTOR = 1e-7  # of a group
 NOTHING = 1e-9
@@ -69,18 +69,15 @@ class BaseParameters:
 
     @property
     def count(self) -> int:
-        """Number of base parameters."""
         return int(self.columns.size)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the base parameters."""
         every = parameter_names(self.chain.joints)
         return tuple(every[column] for column in self.columns)
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Unit of each base parameter."""
         return tuple(map(unit_of, self.names))
 
     @cached_property

@@ -55,7 +55,6 @@ class Chain:
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
         return len(self.axis)
 
     @property
@@ -75,5 +74,4 @@ def parameter_names(joints: int) -> tuple[str, ...]:
 
 
 def unit_of(name: str) -> str:
-    """Return the unit of the parameter with this name."""
     return UNITS[name.partition("_")[0]]

@@ -11,8 +11,7 @@ over the mass, it is
 so that twelve numbers per body replace its 36. The regressor is that of Atkeson, An and Hollerbach, International
 Journal of Robotics Research 5 (1986) 101, in link frames.
 
-Every formula is linear in the links' inertial parameters, so a vector of base parameters, with all others zero, may be
-used instead of the parameters of real links.
+Every formula is linear in the inertial parameters, so base parameters, with all others zero, may replace them.
 """
 
 import math
@@ -249,7 +248,6 @@ def differentiate(gravity: Any, room: Any) -> None:
 
 
 def _flow(b: Any, trace: float, w: Any, out: Any) -> None:
-    """Add 2 B w to out."""
     out[0] += 2.0 * (trace * w[0] - b[13] * w[0] - b[14] * w[1] - b[15] * w[2])
     out[1] += 2.0 * (trace * w[1] - b[16] * w[0] - b[17] * w[1] - b[18] * w[2])
     out[2] += 2.0 * (trace * w[2] - b[19] * w[0] - b[20] * w[1] - b[21] * w[2])

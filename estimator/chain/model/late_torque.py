@@ -2,8 +2,8 @@
 
 The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
 product of back-EMF and lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due
-to back-EMF. A winding's lag makes a joint lighter by at most half of its inertia, where the poles of the equivalent
-motor coincide. A greater loss, far from the minimum of a fit, is limited to this value.
+to back-EMF. The lag of a winding makes a joint lighter by at most half of its inertia, where the poles of the
+equivalent motor coincide. A greater loss, far from the minimum of a fit, is limited to this value.
 """
 
 from collections.abc import Mapping, Sequence
@@ -58,8 +58,8 @@ def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[
 def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -> tuple[str, ...]:
     """Return the names of the lagging back-EMFs that would cancel more inertia than the simulation allows.
 
-    The simulated loss is then too small, which biases the estimated inertias. A back-EMF is named only if its loss
-    exceeds the standard error of a base parameter. std: standard errors; those of the base parameters come first.
+    This biases the estimated inertias. A back-EMF is named only if its loss exceeds the standard error of a base
+    parameter. std: standard errors of the base parameters; those of other parameters may follow.
     """
     generating = _generating(base.chain.joints, parameters)
     most, parts = _most_lost(base, parameters, generating)

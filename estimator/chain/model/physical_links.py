@@ -2,8 +2,8 @@
 
 Each link is described by ten log-Cholesky coordinates (Rucker and Wensing, IEEE Robotics and Automation Letters 7
 (2022) 8250): its pseudo-inertia is U U', where U is upper triangular with a positive diagonal, so that every point
-corresponds to a possible mass distribution. Base parameters only determine sums of the links' parameters; what they
-leave open is weakly regularised towards the description.
+corresponds to a possible mass distribution. What the base parameters leave open is weakly regularised towards the
+description.
 """
 
 from dataclasses import dataclass

@@ -8,10 +8,9 @@ updated as well (a Kalman filter for slowly drifting constants), so the toleranc
 subtracted from the residual. An alarm is raised if the remainder exceeds `TIMES` standard deviations and a fraction of
 the largest planned torque for `HOLD_S`; large residuals raise it sooner.
 
-The noise estimate describes motion, so it is updated only during motion. The residual of a joint at rest is due to
-friction, or to something that blocks it, and would widen the tolerance until nothing exceeded it. A joint at rest is
-also judged by the range of torques on it (`hil.estimator.models.standstill`). A residual that may become an alarm
-enters the noise estimate only after it has ended without an alarm.
+The noise estimate is updated only during motion: the residual of a joint at rest would widen the tolerance until
+nothing exceeded it. A joint at rest is also judged by the range of torques on it (`hil.estimator.models.standstill`). A
+residual that may become an alarm enters the noise estimate only after it has ended without an alarm.
 """
 
 import math

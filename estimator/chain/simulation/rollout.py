@@ -2,8 +2,8 @@
 
 At each sample, a goal torque is added to the torque of a software spring and damper, which is computed from angles and
 velocities of the previous sample as in the real loop. In between, the motion is integrated by the linearly implicit
-Euler method, with the slope of friction at the old velocity. This method is only first-order; the feedback at every
-sample keeps its errors small.
+Euler method, with the slope of friction at the old velocity. The feedback at every sample keeps the errors of this
+first-order method small.
 """
 
 import math
@@ -44,11 +44,9 @@ class ChainArms:
 
     @property
     def size(self) -> int:
-        """Number of arms."""
         return len(self.rigid)
 
     def first(self, count: int) -> "ChainArms":
-        """Return the first `count` arms."""
         return ChainArms(self.base, self.rigid[:count], self.drive[:count])
 
     def and_more(self, others: "ChainArms") -> "ChainArms":
@@ -58,7 +56,6 @@ class ChainArms:
         )
 
     def chosen(self, arms: Any) -> "ChainArms":
-        """Return the arms with these indices."""
         return ChainArms(self.base, self.rigid[arms], self.drive[arms])
 
     @property

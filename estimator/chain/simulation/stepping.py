@@ -242,10 +242,9 @@ def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:
 def _broken(p: Any, v: Any, k: Any, t: Any, solve: Any, step: float, most: int) -> int:
     """Return the number of smaller steps, at most `most`, that replace an undivided one after its first stage.
 
-    A joint that breaks away from standstill in this step was not accelerating before it, so `_pieces` cannot predict
-    this. Friction at the end of the stage then differs from the tangent that the stage assumed; the velocity error
-    that this difference causes may reach CROSSED widths. k: accelerations of the stage. t: motor torques. solve: as
-    `_stage` left it.
+    `_pieces` cannot predict that a joint breaks away from standstill. Friction at the end of the stage then differs
+    from the tangent that the stage assumed; the velocity error that this difference causes may reach CROSSED widths. k:
+    accelerations of the stage. t: motor torques. solve: as `_stage` left it.
     """
     left, inverse = solve[0], solve[2]
     gh = GAMMA * step

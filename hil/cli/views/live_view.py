@@ -59,7 +59,6 @@ class LiveView:
         self._supply = [math.nan] * len(config.joints)
 
     def draw(self, progress: Progress) -> Group:
-        """Render the display for one progress report."""
         self._keep(progress)
         table = Table.grid(padding=(0, 1), pad_edge=False)
         for index, joint in enumerate(self._joints):

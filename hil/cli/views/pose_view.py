@@ -34,19 +34,16 @@ def print_pose(config: Config, pose: Pose) -> None:
 
 
 def print_moved(moved: Moved) -> None:
-    """Print the outcome of moving one joint."""
     style = "green" if moved.well else "red"
     result_console().print(f"[{style}]{'correct' if moved.well else 'WRONG'}[/]: {escape(moved.found)}.")
 
 
 def pose_values(config: Config, pose: Pose) -> dict[str, Any]:
-    """Return the pose as plain values for JSON."""
     names = [joint.name for joint in config.joints]
     return {"angles": dict(zip(names, pose.angles, strict=True)), "end": list(pose.end)}
 
 
 def moved_values(moved: Moved) -> dict[str, Any]:
-    """Return the outcome of moving one joint as plain values for JSON."""
     return {"joint": moved.joint, "asked": moved.asked, "angles": list(moved.angles), "well": moved.well} | {
         "found": moved.found
     }

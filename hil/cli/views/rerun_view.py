@@ -4,7 +4,7 @@
     hil identify arm.toml --live rerun:watch.rrd    # writes a file, to be opened with `rerun watch.rrd`
     hil identify arm.toml --live rerun:rerun+http://localhost:9876/proxy
 
-The viewer receives the same reports as the terminal: about 20 a second, never sent by the control loop itself.
+The viewer receives the same reports as the terminal.
 """
 
 import math

@@ -103,7 +103,6 @@ def _shown(entry: Quantity) -> list[str]:
 
 
 def _numbers(name: str, entry: Quantity, truth: Truth) -> list[str]:
-    """Return the cells of a parameter: value, standard error and, if the true value is known, the error."""
     value, std = entry.value, entry.std
     cells = _shown(entry)
     if name not in truth.values:

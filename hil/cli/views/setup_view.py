@@ -18,7 +18,6 @@ _STYLES = {Level.OK: "green", Level.WARNING: "yellow", Level.STOP: "red"}
 
 
 def print_ports(ports: Sequence[tuple[str, str]], json_only: bool) -> None:
-    """Print the machine's serial ports and the next command to type."""
     if json_only:
         print(json.dumps({"ports": [{"device": device, "description": text} for device, text in ports]}))
         return
@@ -31,7 +30,6 @@ def print_ports(ports: Sequence[tuple[str, str]], json_only: bool) -> None:
 
 
 def scanned(heard: Sequence[Heard]) -> dict[str, Any]:
-    """A scan as plain values for JSON."""
     return {
         "servos": [servo._asdict() for each in heard for servo in each.servos],
         "trouble": [{"baud": each.baud, "trouble": each.trouble} for each in heard if each.trouble],
@@ -104,12 +102,10 @@ def _counted(number: int, what: str) -> str:
 
 
 def changed(changes: Sequence[Change]) -> dict[str, Any]:
-    """The changes made by setup as plain values for JSON."""
     return {"changes": [change._asdict() for change in changes]}
 
 
 def print_changes(changes: Sequence[Change], port: str) -> None:
-    """Print what setup wrote, and the next command."""
     if not changes:
         print("Nothing to change: give --new-id, --new-baud, --return-delay-us or --secondary-id.")
     for change in changes:

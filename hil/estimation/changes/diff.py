@@ -1,10 +1,9 @@
 """Comparison of two identifications of one arm: which parameters changed significantly.
 
-Every common parameter is tested on its own: z = difference / sqrt(std_a^2 + std_b^2). The friction of each joint is
-also tested as a whole (hil.estimation.changes.friction_change). Holm's step-down correction keeps the probability of
-any false alarm in the whole table at `false_alarms` (S. Holm, Scandinavian Journal of Statistics 6 (1979) 65). A change
-must also be larger than the fraction `least_share` of the parameter's magnitude: standard errors cover noise only, and
-two runs of an arm with some unmodelled friction differ by slightly more than these.
+Every common parameter is tested on its own, and the friction of each joint also as a whole
+(hil.estimation.changes.friction_change). Holm's step-down correction keeps the probability of any false alarm in the
+whole table at `FALSE_ALARMS` (S. Holm, Scandinavian Journal of Statistics 6 (1979) 65). A change must also be larger
+than the fraction `least_share` of the parameter's magnitude, since standard errors cover noise only.
 """
 
 import math
@@ -93,12 +92,7 @@ class Difference:
         return asdict(self) | {"changed": [change.name for change in self.changed]}
 
 
-def diff_runs(
-    before: str | PathLike[str],
-    after: str | PathLike[str],
-    false_alarms: float = FALSE_ALARMS,
-    least_share: float = LEAST_SHARE,
-) -> Difference:
+def diff_runs(before: str | PathLike[str], after: str | PathLike[str]) -> Difference:
     """Compare two run folders, result.json files or exported models of one arm. Raises ResultError."""
     before, after = Path(before), Path(after)
     models = read_model(before), read_model(after)
@@ -106,7 +100,7 @@ def diff_runs(
     if counts[0] != counts[1]:
         raise ResultError(f"{before} has {counts[0]} joints and {after} {counts[1]}: they are not the same arm.")
     rows = friction_changes(models, (_covariance(before), _covariance(after)))
-    difference = diff_models(*models, str(before), str(after), false_alarms, least_share, rows)
+    difference = diff_models(*models, str(before), str(after), friction=rows)
     same = (f"{before} is compared with itself.",) if before.resolve() == after.resolve() else ()
     trust = (_trust(before), _trust(after))
     return replace(difference, trust=trust, other_joints=(*same, *difference.other_joints))
@@ -143,7 +137,6 @@ def diff_models(
     after: ArmModel,
     name_before: str = "before",
     name_after: str = "after",
-    false_alarms: float = FALSE_ALARMS,
     least_share: float = LEAST_SHARE,
     friction: Sequence[FrictionChange] = (),
 ) -> Difference:
@@ -154,7 +147,7 @@ def diff_models(
     p = {name: math.erfc(abs(value) / math.sqrt(2)) for name, value in z.items()} | {
         row.name: row.p for row in friction
     }
-    significant = _holm(p, false_alarms)
+    significant = _holm(p, FALSE_ALARMS)
     changes = [
         Change(
             name,
@@ -183,7 +176,7 @@ def diff_models(
         tuple(changes),
         tuple(name for name in before.values if name not in after.values),
         tuple(name for name in after.values if name not in before.values),
-        _detectable(before, friction, false_alarms / max(len(p), 1)),
+        _detectable(before, friction, FALSE_ALARMS / max(len(p), 1)),
         other_joints=_other_joints(before, after),
     )
 
@@ -204,7 +197,6 @@ def _z(before: ArmModel, after: ArmModel, name: str) -> float:
 
 
 def _deviation(value: tuple[float, float], stds: tuple[float, float]) -> float:
-    """Difference of two values in units of their combined standard error."""
     difference = value[1] - value[0]
     std = math.hypot(*stds)
     if not math.isfinite(std):

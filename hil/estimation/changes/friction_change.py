@@ -1,16 +1,15 @@
 """Test whether one joint's friction changed between two runs, using the full covariance of its parameters.
 
-Coulomb friction, its rise at low speed and the speed at which it falls are known far better in combination than
-individually: a change of one of them by 10 % may be less than its own standard error and still be obvious. Let d be the
-difference of the joint's friction parameters between the runs, and S the sum of their covariances in both. Two kinds of
-test are made.
+Friction parameters are known far better in combination than individually: a change of one of them by 10 % may be less
+than its own standard error and still be obvious. Let d be the difference of the joint's friction parameters between the
+runs, and S the sum of their covariances in both. Two kinds of test are made.
 
 one term alone    Did only term i change? The most powerful test is z_i = (S^-1 d)_i / sqrt((S^-1)_ii), and
                   (S^-1 d)_i / (S^-1)_ii is the change that this implies (generalised least squares).
 several at once   Is d anything but noise? d' S^-1 d has a chi-square distribution.
 
-The covariances are marginal ones: changes of inertia, gravity or another joint do not affect the tests. Friction itself
-varies slightly from run to run. The covariance of a single run does not include this, so `repeatability` is added to S.
+Friction itself varies slightly from run to run. The covariance of a single run does not include this, so
+`REPEATABILITY` is added to S.
 """
 
 import math
@@ -18,15 +17,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from hil.arm_model import ArmModel
 from hil.estimator import linalg
+from hil.estimator.arrays import Array
 from hil.estimator.models.terms import TERMS
 from hil.results.parts import Covariance
-
-Array = NDArray[np.float64]
 
 KINDS = ("viscous", "coulomb", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry")
 """Terms of sliding friction, and the width of the Coulomb step, which the data determine only together with the
@@ -62,26 +59,24 @@ class FrictionChange:
 
 
 def friction_changes(
-    models: tuple[ArmModel, ArmModel],
-    covariances: tuple[Covariance | None, Covariance | None],
-    repeatability: float = REPEATABILITY,
+    models: tuple[ArmModel, ArmModel], covariances: tuple[Covariance | None, Covariance | None]
 ) -> list[FrictionChange]:
     """Test the friction of every joint; joints without usable covariances in both runs are left out."""
     if covariances[0] is None or covariances[1] is None:
         return []
     kept = covariances[0], covariances[1]
-    found = (_of_joint(models, kept, joint, repeatability) for joint in range(1, len(models[0].joints) + 1))
+    found = (_of_joint(models, kept, joint) for joint in range(1, len(models[0].joints) + 1))
     return [change for change in found if change is not None]
 
 
 def _of_joint(
-    models: tuple[ArmModel, ArmModel], covariances: tuple[Covariance, Covariance], joint: int, repeatability: float
+    models: tuple[ArmModel, ArmModel], covariances: tuple[Covariance, Covariance], joint: int
 ) -> FrictionChange | None:
     names = [name for kind in KINDS if _comparable(models, name := f"{kind}_{joint}")]
     values = [np.array([model.values.get(name, 0.0) for name in names]) for model in models]
     scale = np.maximum(*np.abs(values))
     spread = sum(_block(kept, model, names) for kept, model in zip(covariances, models, strict=True))
-    spread = spread + np.diag(2 * (repeatability * scale) ** 2)
+    spread = spread + np.diag(2 * (REPEATABILITY * scale) ** 2)
     usable = np.isfinite(np.diag(spread)) & (scale > 0)
     if not usable.any():
         return None

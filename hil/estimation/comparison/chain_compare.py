@@ -4,12 +4,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.errors import ConfigError
 from hil.estimation.chain_estimate import true_chain_parameters, wanted_chain_model
 from hil.estimation.settled_period import settled_period
+from hil.estimator.arrays import Array
 from hil.estimator.baselines.compare import Peer, joined
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.fit.regression import fit_filtered
@@ -30,8 +30,6 @@ LARGE = 0.1
 """Parameters below this fraction of the largest of their kind are left out of the comparison: near zero, a relative
 error is meaningless.
 """
-
-Array = NDArray[np.float64]
 
 
 def compare_chain(run: RunFolder, mujoco: bool) -> tuple[Mapping[str, float] | None, dict[str, Peer], "Judge"]:

@@ -59,7 +59,7 @@ class Comparison:
     methods: Mapping[str, MethodResult]
 
 
-def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> Comparison:
+def compare_run(run: RunFolder, mujoco: bool) -> Comparison:
     """Apply every method to the settled period of `run` and write compare.json to its folder.
 
     Raises HilError, EstimationError.
@@ -71,7 +71,7 @@ def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> Comparison:
     period = settled_period(config, facts, samples, IDENTIFY)
     held_out = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
     truth = true_parameters(config)
-    peers = {peer.name: peer for peer in all_methods(config, period, truth, mujoco, seed)}
+    peers = {peer.name: peer for peer in all_methods(config, period, truth, mujoco)}
     methods = {name: judged(peer, truth_for(peer, truth, config), held_out) for name, peer in peers.items()}
     compared = Comparison(SCHEMA, facts.config, truth_for(peers[OURS], truth, config), methods)
     write_json(run.path / "compare.json", to_json(compared))
@@ -98,7 +98,7 @@ def truth_for(peer: Peer, truth: Mapping[str, float] | None, config: Config) -> 
 
 
 def all_methods(
-    config: Config, period: SettledPeriod, truth: Mapping[str, float] | None, mujoco: bool, seed: int
+    config: Config, period: SettledPeriod, truth: Mapping[str, float] | None, mujoco: bool
 ) -> Iterator[Peer]:
     """Yield hil's own estimate, then those of the other methods."""
     ours = _ours(period, OURS, wanted_model(config.model, period.joints, voltage_driven(config)))
@@ -113,7 +113,7 @@ def all_methods(
         centre = {name: ours.parameters[name] for name in ours.std if name in ours.parameters}
         centre |= truth_for(ours, truth, config) or {}
         yield _ours(period, OURS_PLAIN, Model(period.joints, "coulomb", "delay"))
-        yield fit_with_mujoco(period, centre, length or 0.0, config.arm.gravity, seed)
+        yield fit_with_mujoco(period, centre, length or 0.0, config.arm.gravity)
 
 
 def link_length(config: Config) -> float | None:
@@ -147,8 +147,7 @@ def _entry(peer: Peer, held_out: float | None, name: str | None, worst: float | 
 def worst_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
     """Return the inertia, gravity or friction parameter with the largest relative error, and that error.
 
-    Offsets are left out: they are near zero, so a relative error is meaningless. A parameter that the method does not
-    estimate counts as 0, a relative error of 1.
+    Offsets, near zero, are left out. A parameter that the method does not estimate counts as 0, a relative error of 1.
     """
     errors = {
         name: abs(parameters.get(name, 0.0) / true - 1.0)

@@ -4,8 +4,7 @@ The arm is a MuJoCo model with one or two hinges. The unknowns are the first mom
 armature of joint 2, and each joint's damping, friction loss and constant torque, all scaled by expected values. The
 method gets every advantage: an initial guess within 50 % of the expected values (from farther away, it does not
 converge), the length of link 1, the initial state from the period's Fourier lines, the delay found by hil's stage 1,
-mujoco.sysid's own optimiser with rollouts on all cores, and the smallest number of integration steps per sample (two)
-that does not change its answer.
+and mujoco.sysid's own optimiser with rollouts on all cores.
 """
 
 import importlib
@@ -40,7 +39,7 @@ def import_mujoco() -> tuple[Any, Any]:
     return mujoco, sysid
 
 
-def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: float, gravity: float, seed: int) -> Peer:
+def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: float, gravity: float) -> Peer:
     """Fit with mujoco.sysid, starting from values drawn within 50 % of `centre` (base parameters by name [SI]).
 
     `length`: length of link 1 [m]. `gravity`: acceleration of gravity [m/s^2]. Raises MissingExtra if mujoco[sysid] is
@@ -50,7 +49,7 @@ def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: flo
     linear = fit_lines(period)
     arm = _Arm.of(centre, period.joints, length, gravity)
     spec = mujoco.MjSpec.from_string(_xml(arm, 1.0 / (STEPS * period.rate)))
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     parameters = sysid.ParameterDict()
     for name, value in arm.values.items():
         low, high = (-BOUNDS[1], BOUNDS[1]) if name.startswith("offset") else BOUNDS
@@ -131,7 +130,6 @@ class _Arm:
 
 
 def _sequences(mujoco: Any, sysid: Any, spec: Any, period: SettledPeriod, linear: LinearEstimate) -> Any:
-    """The commands and positions of the period as MuJoCo time series."""
     model = spec.compile()
     steps = STEPS * period.samples
     at = np.arange(steps) * model.opt.timestep

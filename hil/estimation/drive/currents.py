@@ -1,8 +1,7 @@
 """Currents that differ from the commanded ones: they were clipped, or this program's goals did not cause them.
 
 A clipped current is smaller than a large goal, follows a small one, and never opposes it. Any other deviation has
-another cause: goals were altered in transit or by another program, or the reported current is wrong. The torque that
-drove the arm is then not the one that the estimate is based on.
+another cause: goals were altered in transit or by another program, or the reported current is wrong.
 """
 
 from dataclasses import dataclass
@@ -12,9 +11,8 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.estimator.arrays import Array, Mask
 from hil.runs.recording import Phase
-
-Array = NDArray[np.float64]
 
 LARGE = 0.5
 """Goals above this fraction of the largest one count as large; smaller ones say little about clipping."""
@@ -67,7 +65,7 @@ def current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindin
     return _findings(config, samples, np.ones(len(samples), bool))
 
 
-def _findings(config: Config, samples: NDArray[np.void], judged: NDArray[np.bool_]) -> CurrentFindings:
+def _findings(config: Config, samples: NDArray[np.void], judged: Mask) -> CurrentFindings:
     """Like `current_findings`, but only for the judged samples; the others only help to measure the noise."""
     lower = "current_limit" if config.experiment.pilot else "peak_torque"
     warnings, names = [], []
@@ -102,8 +100,7 @@ def _noise(goal: Array, measured: Array) -> float:
     """Standard deviation of a current reading, from the recording itself: its scatter at constant goals or, if larger,
     its deviation from the goals or the second difference of that, whichever is smaller.
 
-    Differences are smaller if the deviation is smooth, plain values if goals are often altered. The current may lag
-    the goal by a few samples: the lag that leaves the smallest deviation is used.
+    The current may lag the goal by a few samples: the lag that leaves the smallest deviation is used.
     """
     count = len(goal) - _RECENT
     if count < _RECENT:

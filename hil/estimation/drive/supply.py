@@ -1,9 +1,9 @@
 """Supply sag under load: its detection from the servos' Present Input Voltage, and its effect on the torque.
 
-A motor at velocity v draws a supply current with terms in u^2 and u v if it is driven with voltage u, or in i^2
-and i v if it is driven with current i. The resistance of the supply turns this current into a voltage drop. The
-register is read only a few times a second, in steps of 0.1 V. A regression of its readings on these products over the
-whole recording nevertheless gives the drop at every sample.
+A motor at velocity v draws a supply current with terms in u^2 and u v if it is driven with voltage u, or in i^2 and i v
+if it is driven with current i. The resistance of the supply turns this current into a voltage drop. The register is
+read only a few times a second, in steps of 0.1 V; a regression of its readings on these products gives the drop at
+every sample.
 
 A voltage-driven joint receives its duty cycle times the supply voltage at that moment: its torque sags with it. A
 current-driven joint is not affected as long as its servo can still drive the current.
@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 from hil.estimator import linalg
-
-Array = NDArray[np.float64]
+from hil.estimator.arrays import Array, Mask
 
 FEWEST = 40
 """Minimum number of voltage readings."""
@@ -79,7 +78,7 @@ def supply_sag(config: Config, samples: NDArray[np.void]) -> Sag | None:
     return sag if sag.worst > SIGNIFICANT * std and sag.share > least else None
 
 
-def by_voltage(config: Config) -> NDArray[np.bool_]:
+def by_voltage(config: Config) -> Mask:
     """Whether each joint is driven by voltage (joints,)."""
     return np.array([joint.drive_mode is Mode.PWM for joint in config.joints])
 

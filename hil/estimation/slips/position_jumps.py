@@ -1,17 +1,16 @@
 """Jumps of a position that its velocity does not explain: an encoder that slipped, or a horn that moved on its shaft.
 
-The guard stops a run at once if a position moves farther between two samples than the joint can; a smaller jump only
-shifts everything after it, and looks like an offset of the zero.
+The guard stops a run at once if a position moves farther than the joint can; a smaller jump only shifts everything
+after it.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.estimator.arrays import Array
 from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
-
-Array = NDArray[np.float64]
 
 LEAST_STEPS = 8.0  # encoder steps, smallest jump that is reported
 USUAL_QUANTILE = 0.995
@@ -56,7 +55,6 @@ def jump_disturbances(config: Config, facts: RunFacts, samples: NDArray[np.void]
 
 
 def _jumps(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> list[list[tuple[float, float]]]:
-    """Jumps of each joint, as in `position_jumps`, with times from the first sample."""
     begin = float(samples["deadline"][0]) if len(samples) else 0.0
     return [
         position_jumps(

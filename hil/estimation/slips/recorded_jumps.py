@@ -1,20 +1,17 @@
 """Jumps of a recorded position that no smooth motion explains, for recordings without a velocity.
 
-Around each interval between samples, a cubic with a step is fitted to the positions; the step is compared with those
-that the same fit finds elsewhere in the recording.
+Around each interval between samples, a cubic with a step is fitted to the positions, and compared with those elsewhere.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.estimation.slips.position_jumps import FAR_OUTSIDE, LEAST_STEPS, USUAL_QUANTILE
 from hil.estimator import linalg
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import Recording
-
-Array = NDArray[np.float64]
 
 SIDE = 5  # samples on either side of an interval
 ORDER = 3  # of the polynomial that describes a smooth motion over these samples
@@ -96,7 +93,7 @@ def _jumps(recording: Recording, joint: int) -> list[tuple[float, float]]:
     return found
 
 
-def _steps(time: Array, position: Array, uneven: NDArray[np.bool_]) -> Array:
+def _steps(time: Array, position: Array, uneven: Mask) -> Array:
     """The step in the middle of every window of 2 SIDE samples [rad]. `uneven`: where intervals are unequal."""
     windows = np.lib.stride_tricks.sliding_window_view
     sizes = np.correlate(position, _weights(np.arange(2.0 * SIDE)[None, :])[0], mode="valid")

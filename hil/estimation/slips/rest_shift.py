@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_prior import servo_prior
+from hil.estimator.arrays import Array
 from hil.plan.plan import rest_window
 from hil.results.result import SettledResult
 from hil.runs.recording import Phase
@@ -26,7 +27,7 @@ _STILL_RAD = 0.02
 def rest_shift_warnings(config: Config, samples: NDArray[np.void], result: SettledResult) -> list[str]:
     """One sentence per joint whose rest angle changed by more than friction usually explains.
 
-    Nothing is reported if the verdict trusts the model, if the arm is horizontal, or if a stabiliser holds it.
+    Nothing is reported if the verdict trusts the model, or if the arm is horizontal or held by a stabiliser.
     """
     trusted = result.verdict is not None and result.verdict.trust == "yes"
     if trusted or config.arm.gravity == 0.0 or config.stabiliser is not None or config.is_chain:
@@ -49,14 +50,14 @@ def rest_shift_warnings(config: Config, samples: NDArray[np.void], result: Settl
     return found
 
 
-def _gravity(result: SettledResult, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def _gravity(result: SettledResult, pose: Array) -> Array:
     """Torque of gravity at a pose (joints,) [N m]."""
     weight = [result.parameters[f"gravity_{number}"].value for number in range(1, len(pose) + 1)]
     each = weight * np.cos(np.cumsum(pose))
     return np.asarray(np.cumsum(each[::-1])[::-1])  # each joint carries the links beyond it
 
 
-def _resting(config: Config, samples: NDArray[np.void], phase: Phase) -> NDArray[np.float64] | None:
+def _resting(config: Config, samples: NDArray[np.void], phase: Phase) -> Array | None:
     """Median of the last positions of a phase (joints,) [rad]; None if a joint has none or is still moving."""
     rows = samples[samples["phase"] == phase][-rest_window(config.experiment.rate) :]
     position = rows["position"]

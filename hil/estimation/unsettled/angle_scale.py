@@ -3,8 +3,7 @@
 A joint's equation is linear in its angle except for gravity, so only gravity reveals the scale. Near the angle at which
 the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, a weaker gravity and a spring: with a
 spring, an offset and an encoder zero, a fit explains angles with a wrong scale s down to the noise, but with wrong
-values. So if a fit found a spring, the motion is fitted again with the wrong scale that would look like this spring,
-but without a spring and with the encoder zeros as given.
+values. So if a fit found a spring, the motion is fitted again with the scale that would look like this spring instead.
 """
 
 import math
@@ -12,13 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
-
-Array = NDArray[np.float64]
 
 SPRING = "cable_stiffness_1"
 CERTAIN = 4.0  # standard errors of a spring that is worth a closer look

@@ -7,7 +7,8 @@ import numpy as np
 
 from hil.estimation.unsettled.agreement import disagreement
 from hil.estimation.unsettled.defects import defect_said, is_certain, is_other_arm, likely_defect
-from hil.estimation.unsettled.local_defects import Array, local_defects, local_residual
+from hil.estimation.unsettled.local_defects import local_defects, local_residual
+from hil.estimator.arrays import Array
 from hil.estimator.baselines.torque_faults import suspect_clipped, suspect_drift, suspect_late, suspect_uneven
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate

@@ -70,14 +70,9 @@ def estimate_chain_recordings(
     base = BaseParameters.of(Chain(*arm.geometry, gravity), tilts=config.model.base_tilt)
     prior = Prior.of(base, arm.parameters)
     wanted = config.model
+    drive = _drive(config, base.chain.joints)
     model = ChainModel(
-        *(
-            base,
-            wanted.fixed_friction,
-            _drive(config, base.chain.joints),
-            wanted.zeros,
-            wanted.torque_scale and base.chain.joints > 1,
-        ),
+        *(base, wanted.fixed_friction, drive, wanted.zeros, wanted.torque_scale and base.chain.joints > 1),
         base_tilt=wanted.base_tilt,
         lags=base.chain.joints > 1,
         by_voltage=tuple(range(1, base.chain.joints + 1)) if config.columns.drive in {"voltage", "pwm"} else (),

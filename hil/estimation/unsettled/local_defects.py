@@ -1,19 +1,15 @@
 """Location and kind of the parts of a recording that the fitted model does not explain although it explains the rest.
 
-A reading that freezes, a missing torque, single wrong samples or a joint that hits a stop can spoil an estimate.
-The residual alone would suggest wrong units or a missing term.
+These are frozen readings, missing torques, single wrong samples, and stops.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import Recording
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 FAR_ABOVE = 10.0  # residual of a window, or of a stretch, relative to the usual one of its joint
 ABOVE_NOISE = 5.0  # the same, relative to the noise
@@ -237,6 +233,5 @@ def _from_to(time: Array, part: slice) -> str:
 
 
 def _at(times: Array) -> str:
-    """Text that lists the times, or only the first ones."""
     shown = ", ".join(f"{each:.3f}" for each in times[:SHOWN])
     return f"at {shown} s" if len(times) <= SHOWN else f"the first at {shown} s"

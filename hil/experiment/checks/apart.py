@@ -1,10 +1,8 @@
 """Check that the servos of one joint turn together.
 
-Two servos on one joint are coupled by their horns. A horn that slips, a loose screw or a broken gear lets one of them
-turn without the other. The joint's angle is taken from the first servo and does not show this. The difference between
-their angles is compared with its value at the first sample, because horns may be mounted at any angle. If the
-configured direction of one servo is wrong, the servos work against each other. The joint then does not turn at all, as
-if an obstacle held it.
+A horn that slips, a loose screw or a broken gear lets one servo turn without the other. The joint's angle, taken from
+the first servo, does not show this. The difference between their angles is compared with its value at the first sample,
+because horns may be mounted at any angle.
 """
 
 from collections.abc import Sequence

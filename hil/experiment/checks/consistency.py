@@ -25,8 +25,7 @@ compared with the encoder noise so far: `STEPS` jumps within `STEPS_S` count as 
 
 If a healthy servo reports exactly the same velocity for some time, the joint really moved at that velocity, except
 perhaps during the last `LAG_S`. The distance covered before that must therefore equal velocity times time; otherwise,
-the reported velocity is frozen. This detects a velocity that freezes near its peak sooner than the memories do, in
-which a lag could explain the difference.
+the reported velocity is frozen.
 
 Lag and scale error are properties of a servo and do not change. A lag that changes is a fault
 (`hil.experiment.velocity.lag`). Once the motion has shown them, up to twice the estimated values are accepted, plus
@@ -106,7 +105,7 @@ samples per period, the fastest that is used, needs 0.27.
 ROUGH_TIMES = 2.0
 """Allowance of the slow memory for a velocity that jumps between samples, as when gear teeth change sides: a multiple
 of the root sum of squares of `CURVED` times the difference between successive changes, times the interval. A jump
-anywhere within an interval causes an RMS error of 0.29 times the jump times the interval, and counts twice.
+within an interval causes an RMS error of 0.29 times the jump times the interval, and counts twice.
 """
 
 CURVED_AT_FIRST = 0.3

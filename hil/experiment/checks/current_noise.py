@@ -1,7 +1,7 @@
 """Noise of the current readings, measured while the arm rests, and what it means for the check of the current.
 
 The thresholds of `following` assume no more noise than usual. A noisier sensor gets wider ones, so that a healthy motor
-is not stopped; the user is told the goal below which lost torque is then not detected quickly.
+is not stopped.
 """
 
 from collections import deque
@@ -35,8 +35,7 @@ MOST_NOISE = 0.25
 class CurrentNoise:
     """Standard deviation of the joints' current readings, measured at goals that hardly change.
 
-    Every reading is compared with its goal. The median absolute deviation ignores single wrong replies, and a current
-    that constantly differs from its goal does not count as noise.
+    Every reading is compared with its goal. The median absolute deviation ignores single wrong replies.
     """
 
     def __init__(self, joints: Sequence[JointConfig]) -> None:

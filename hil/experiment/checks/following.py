@@ -1,8 +1,7 @@
 """Check that a motor carries the commanded current, using the current (or voltage) reported in each reply.
 
-A servo may lose its torque in the middle of a run because it rebooted, its watchdog stopped it, or another program
-switched it off. Its current is then zero, whatever is commanded. How much current is missing depends on the plan, not
-on what the servo could carry, so all thresholds are relative to the planned peak.
+A servo that loses its torque in the middle of a run (reboot, watchdog, another program) carries no current, whatever is
+commanded. All thresholds are relative to the planned peak.
 
 Two hypotheses are compared on every sample, sequentially (E. S. Page, "Continuous inspection schemes", Biometrika 41
 (1954) 100): the current is the one commanded, or it is zero. Their log likelihood ratio, for errors of standard
@@ -10,13 +9,12 @@ deviation sigma, grows by
 
     [(distance from the commanded current)^2 - (distance from zero)^2] / (2 sigma^2)
 
-per sample. The step is bounded so that no single reply decides, and the sum is kept at or above zero. The commanded
-current is any value between the last two goals, because a reply may be measured before or after the motor follows the
-latest goal, and may be off by a scale error of `GAIN_ERROR`.
+per sample. The step is bounded so that no single reply decides. The commanded current is any value between the last two
+goals, because a reply may be measured before or after the motor follows the latest goal, and may be off by a scale
+error of `GAIN_ERROR`.
 
-Successive errors may be correlated, so each sample is weighted by the time that it represents. Nor must chance decide
-in one of thousands of checks: the unweighted sum must also reach h = `LEAST_RATIO`, which a healthy motor's does with a
-probability of at most exp(-h) after any given check.
+Successive errors may be correlated, so each sample is weighted by the time that it represents. The unweighted sum must
+also reach h = `LEAST_RATIO`, which a healthy motor's does with a probability of at most exp(-h) after any given check.
 
 While a joint stands still, its readings may also freeze at the commanded current, and the goal may take seconds to get
 far from it. But a motor's current follows its goal: if all three readings stay exactly the same although the goals
@@ -25,7 +23,7 @@ this comparison.
 
 A current sensor may be noisier than assumed. Its noise is measured at constant goals, while the arm rests before the
 start (`current_noise`), and is a lower bound of sigma: a noisy reading then means that lost torque is found later, not
-that a healthy motor is stopped. A joint so noisy that the check would be useless is refused.
+that a healthy motor is stopped.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). The state that it keeps for
 a joint is a record of the type `MEMORY`.

@@ -27,11 +27,7 @@ FARTHER_OUT_RAD = 0.01
 """How much farther out a joint may move if an earlier run left it beyond its limit [rad]."""
 
 MOST_OUTSIDE_RAD = 0.5
-"""How far beyond its limit a joint may start if an earlier run left it there [rad].
-
-A light arm that was stopped at a limit coasts on by a few tenths of a radian, and friction holds it there; an upright
-arm that has fallen comes to rest farther away.
-"""
+"""How far beyond its limit a joint may start if an earlier run left it there [rad]; a light arm coasts on."""
 
 LONG_GAP = 3.0
 """If the gap between two samples is longer than this [sample intervals], the motion in between is too uncertain to

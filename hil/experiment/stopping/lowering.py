@@ -1,10 +1,9 @@
 """Stop of an arm that cannot hang freely: brake, then lower it to its rest pose while its servos accept commands.
 
-The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the path
-to the rest pose; if a joint stays off the path, an additional torque towards the path grows. Lowering is monitored like
-the experiment. It is aborted and torque is cut if a servo loses its torque, if a current does not follow its goal, if a
-joint leaves the path, or if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities
-that agree with the positions.
+The feed-forward torque is combined with the stabiliser's spring and damper, which track the path to the rest pose;
+while a joint is off the path, an additional torque towards it grows. Lowering is monitored like the experiment; torque
+is also cut if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities that agree
+with the positions.
 
 Replies may be missing for a moment, even at the beginning: joints that are not heard get only the feed-forward torque.
 """
@@ -13,7 +12,6 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
@@ -21,6 +19,7 @@ from hil.drivers.errors import BusOverheard
 from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import Cause, ExperimentError, SafetyStop
+from hil.estimator.arrays import Array
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
 from hil.experiment.stopping.pace import LONGEST_S
@@ -117,8 +116,8 @@ class Lowering:
         ]
         return ", ".join(found)
 
-    def _away(self, state: State) -> NDArray[np.float64]:
-        away: NDArray[np.float64] = np.array(state.position) - self._rest
+    def _away(self, state: State) -> Array:
+        away: Array = np.array(state.position) - self._rest
         return away
 
     def begin(
@@ -133,8 +132,7 @@ class Lowering:
         lowering takes.
 
         goal: latest goals [A or V]. recent: the latest exchanges. watch: the check against the model, which has seen
-        the motion so far. Without it, a motor that turns against its goal is detected only when its joint runs away.
-        noise: noise of each joint's current readings [A or V], if known.
+        the motion so far. noise: noise of each joint's current readings [A or V], if known.
         """
         self._recent, self._watch, self._noise = recent, watch, noise
         self._obedience = Obedience(len(state.position))
@@ -150,10 +148,10 @@ class Lowering:
         """Plan another path home from this sample; return its number of samples."""
         return self._set_out(state, self._believed(state), goal)
 
-    def _believed(self, state: State) -> NDArray[np.float64]:
+    def _believed(self, state: State) -> Array:
         return np.array(self._recent.until(state).believed(state))
 
-    def _set_out(self, state: State, velocity: NDArray[np.float64], goal: list[float]) -> int:
+    def _set_out(self, state: State, velocity: Array, goal: list[float]) -> int:
         """Plan a path home from this sample; return its number of samples."""
         position = np.array(state.position)
         self._path = self._way.path(position, velocity)
@@ -173,7 +171,7 @@ class Lowering:
             noise=self._noise,
         )
         self._guard.holding(goal)
-        self._excess = deque[tuple[float, NDArray[np.float64]]]()
+        self._excess = deque[tuple[float, Array]]()
         self._against = np.zeros_like(position)
         self._paths += 1
         self.needs_another_path = False
@@ -247,7 +245,7 @@ class Lowering:
         if runs.any():
             self._look_at_runaway(int(np.argmax(runs)), velocity, now)
 
-    def _look_at_runaway(self, joint: int, velocity: NDArray[np.float64], now: float) -> None:
+    def _look_at_runaway(self, joint: int, velocity: Array, now: float) -> None:
         """Test a joint that speeds up although its torque opposes the motion. Raises SafetyStop if there is no model,
         or if the joint is so fast that its motor no longer matters.
         """

@@ -1,7 +1,7 @@
 """Choose how often to command an arm that is being lowered, and how long to wait for replies, adapting to late ones.
 
-Servos hold their latest goal, so an arm can be lowered with fewer exchanges than the experiment needs. If replies come
-too late for one exchange per sample, only every second or third sample is exchanged from then on, until the end.
+Servos hold their latest goal. If replies come too late for one exchange per sample, only every second or third sample
+is exchanged from then on, until the end.
 """
 
 from math import ceil
@@ -12,9 +12,7 @@ first, to the timeout used during the experiment.
 """
 
 LONGEST_S = 0.022
-"""Reply timeout after some replies have been late [s]: longer than an adapter's latency timer of 16 ms. If
-replies are lost instead of late, it is better to ask again soon.
-"""
+"""Reply timeout after some replies have been late [s]: longer than an adapter's latency timer of 16 ms."""
 
 LAST_S = 0.075
 """Time after the latest reply at which waiting always ends [s]: torque must be off 25 ms later."""

@@ -1,8 +1,7 @@
 """Correction of steps in a position reading while an arm is lowered: a joint cannot jump, but its reading can.
 
 A reading that is far from the position predicted from the previous position and the velocities counts as false: from
-then on, the difference is subtracted. When a later reading steps back, the subtraction ends. A joint whose readings
-step again and again is no longer corrected.
+then on, the difference is subtracted. A joint whose readings step again and again is no longer corrected.
 """
 
 from typing import NamedTuple
@@ -47,7 +46,6 @@ class PositionSteps:
         return state._replace(position=tuple(position)) if any(self._offset) else state
 
     def _continued(self, joint: int, now: _Seen) -> float:
-        """Return the corrected position of a joint [rad]."""
         seen = self._seen[joint]
         if self._steps[joint] < MOST_STEPS and _is_step(seen, now.position + self._offset[joint], now):
             self._steps[joint] += 1

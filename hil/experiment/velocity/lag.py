@@ -1,13 +1,12 @@
 """Estimate the lag and scale error of a servo's velocity relative to its position, and detect a lag that changes.
 
-Servos filter their velocities, so any servo may have a lag. It is the slope of the difference `apart` (see
-`hil.experiment.checks.consistency`) over the velocity minus its mean in the short memory; a scale error is the slope
-over the distance covered. Both are estimated by least squares, together with a constant. The more the velocity has
-changed, the more certain the estimates are.
+The lag is the slope of the difference `apart` (see `hil.experiment.checks.consistency`) over the velocity minus its
+mean in the short memory; a scale error is the slope over the distance covered. Both are estimated by least squares,
+together with a constant.
 
 Neither error changes during a run. The lag in the last `BLOCKS` blocks of `BLOCK_S` is therefore compared with that in
-all earlier blocks: the difference must not exceed what is explained by their uncertainties and by a filter, whose lag
-depends on the frequency of the motion.
+all earlier blocks, with a tolerance for their uncertainties and for a filter, whose lag depends on the frequency of the
+motion.
 """
 
 from typing import Any

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from hil.clearance.doubts import near_by_design, unchecked
 from hil.clearance.space import Space
+from hil.estimator.arrays import Array
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table
 from hil.runs.recording import Phase
@@ -27,7 +28,7 @@ def clearance(data: RunData) -> Section | None:
     return Section("clearance", "Clearance", words, (table,), bullets=(*near_by_design(space), *unchecked(space)))
 
 
-def _row(space: Space, name: str, poses: NDArray[np.float64], on_the_way: bool) -> tuple[str, ...] | None:
+def _row(space: Space, name: str, poses: Array, on_the_way: bool) -> tuple[str, ...] | None:
     if not poses.shape[1]:
         return None
     found = space.nearest(poses, on_the_way)
@@ -36,10 +37,10 @@ def _row(space: Space, name: str, poses: NDArray[np.float64], on_the_way: bool) 
     return name, " and ".join(found.pair), _millimetres(found.distance), _millimetres(found.needed)
 
 
-def _poses(data: RunData, space: Space, phases: tuple[Phase, ...]) -> NDArray[np.float64]:
+def _poses(data: RunData, space: Space, phases: tuple[Phase, ...]) -> Array:
     """Poses away from the rest pose (joints, poses) [rad]."""
     every = max(1, round(data.config.experiment.rate / _LOOKED_AT_HZ))
-    position: NDArray[np.float64] = data.samples["position"]
+    position: Array = data.samples["position"]
     phase: NDArray[np.uint8] = data.samples["phase"]
     q = position[np.isin(phase, phases)][::every].T
     q = q[:, np.isfinite(q).all(axis=0)]

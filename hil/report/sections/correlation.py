@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from hil.report.chart import Array, Matrix
+from hil.estimator.arrays import Array
+from hil.report.chart import Matrix
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section
 from hil.results.result import Result

@@ -5,8 +5,9 @@ gravity are subtracted, for the measured and for the model's motion.
 import numpy as np
 
 from hil.arm_model import ArmModel
+from hil.estimator.arrays import Array
 from hil.estimator.data.fourier import Lines, cut_off, lines_of, motion_of
-from hil.report.chart import BLUE, GREY, ORANGE, Array, Chart, Series
+from hil.report.chart import BLUE, GREY, ORANGE, Chart, Series
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section
 from hil.results.parts import Covariance

@@ -9,7 +9,6 @@ from hil.report.words import number, percent
 
 
 def limits(data: RunData) -> Section:
-    """Return this section of the report."""
     rows: list[tuple[str, ...]] = []
     for index, joint in enumerate(data.config.joints):
         position, velocity = data.samples["position"][:, index], data.samples["velocity"][:, index]

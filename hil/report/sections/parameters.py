@@ -18,7 +18,6 @@ _MOST_DECIMALS = 9
 
 
 def parameters(data: RunData) -> Section:
-    """Return this section of the report."""
     truth = truth_of(data.result, data.config)
     return parameters_of(data.result, truth.values, truth.note)
 
@@ -73,7 +72,6 @@ def _interval(value: float, std: float) -> tuple[str, str]:
 
 
 def _as_precise(value: float, std: float) -> str:
-    """Format a value with the decimals shown for a quantity with this standard deviation."""
     decimals = _decimals(std)
     return number(value) if decimals is None else f"{value:.{decimals}f}".replace("-", "\u2212")
 

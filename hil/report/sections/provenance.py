@@ -6,7 +6,6 @@ from hil.runs.run_folder import Excitation
 
 
 def provenance(data: RunData) -> Section:
-    """Return this section of the report."""
     record, config = data.record, data.config
     servos = "; ".join(f"{joint.name}: {joint.model}, ID {joint.id}" for joint in config.joints)
     rows = [

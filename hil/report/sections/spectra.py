@@ -4,9 +4,10 @@ from itertools import cycle
 
 import numpy as np
 
+from hil.estimator.arrays import Array
 from hil.estimator.data.fourier import lines_of, noise_power
 from hil.plan.plan import IDENTIFY
-from hil.report.chart import BLUE, GREEN, GREY, OF_JOINTS, ORANGE, Array, Chart, Series
+from hil.report.chart import BLUE, GREEN, GREY, OF_JOINTS, ORANGE, Chart, Series
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section, Table
 from hil.report.words import steps
@@ -52,7 +53,6 @@ def _levels(data: RunData) -> tuple[Table, ...]:
 
 
 def _excited(data: RunData) -> list[list[int]]:
-    """Excited harmonics of each joint."""
     entry = next(entry for entry in data.record.excitation if entry.role == IDENTIFY)
     return [list(lines) for lines in entry.lines]
 

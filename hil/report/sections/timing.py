@@ -1,8 +1,8 @@
 """Section on the timing of the stream."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array
 from hil.report.chart import BLUE, GREEN, Chart, Series
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section, Table
@@ -10,15 +10,13 @@ from hil.report.words import number
 from hil.results.parts import Quantiles
 
 _BINS = 60
-Values = NDArray[np.float64]
 
 
 def timing(data: RunData) -> Section:
-    """Return this section of the report."""
     samples = data.samples
-    deadline: Values = samples["deadline"]
-    written: Values = samples["time_before_write"]
-    read: Values = samples["time_after_read"]
+    deadline: Array = samples["deadline"]
+    written: Array = samples["time_before_write"]
+    read: Array = samples["time_after_read"]
     sent = read > written
     lateness = 1e6 * (written - deadline)[sent]
     round_trip = 1e6 * (read - written)[sent]
@@ -53,7 +51,7 @@ def _quantiles(values: Quantiles) -> str:
     return ", ".join(number(value, 4) for value in (values.p50, values.p99, values.max)) + " µs"
 
 
-def _histogram(name: str, title: str, values: NDArray[np.float64], colour: str) -> Picture:
+def _histogram(name: str, title: str, values: Array, colour: str) -> Picture:
     # Without the largest 0.1 %: a single stall would compress all other values into one bar.
     most = float(np.quantile(values, 0.999))
     low = float(values.min())

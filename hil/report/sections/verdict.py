@@ -14,7 +14,6 @@ TITLES = {
 
 
 def verdict(data: RunData) -> Section:
-    """Return this section of the report."""
     judged = data.result.verdict
     tone, title = TITLES[judged.trust]
     warnings = [f"Warning: {warning}" for warning in data.result.warnings]

@@ -1,7 +1,7 @@
-"""Settings that a killed program left on the servos: some can be restored, others have been changed by another program.
+"""Settings that a killed program left on the servos.
 
 If a register holds neither the value that the killed program set nor the earlier one, another program has changed it.
-It is not restored, since the user may have wanted the change, but it is reported together with its earlier value.
+It is not restored, since the user may have wanted the change, but it is reported.
 """
 
 from collections.abc import Mapping

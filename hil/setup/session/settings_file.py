@@ -1,9 +1,8 @@
 """The servos' settings before a program changed them, in files that outlive the program.
 
 There is one file per servo in the user's state folder, named after port, ID and model: however a program ends, the next
-program on that port finds the file and restores the settings. The name of a USB port may change when the cable is
-plugged in again, and may then be that of another arm. An adapter with a serial number is therefore named instead of the
-port.
+program on that port finds the file and restores the settings. An adapter with a serial number is named instead of the
+port, whose name may later be that of another arm.
 """
 
 import json
