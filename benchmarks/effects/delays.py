@@ -1,6 +1,9 @@
-"""Recordings of planar arms whose joints' torques come late by different times: values, intervals and verdicts.
+"""Recordings of planar arms whose joints are late by different times: values, intervals and verdicts.
 
-    python benchmarks/effects/delays.py [--json] [--arms 10] [--first 0] [--law delay|lag] [--longest 3]
+    python benchmarks/effects/delays.py [--json] [--arms 10] [--first 0] [--law delay|lag|logged] [--longest 3]
+
+delay: each joint's torque comes late; lag: it passes a first-order filter; logged: the position of joint 2 is logged
+later than that of joint 1.
 
 Each arm has links, friction and a multisine torque drawn at random. Its positions come from equations of motion of this
 script's own, in absolute angles, with steps of 20 us; noise is added, and some are rounded as an encoder does. The file
@@ -26,6 +29,7 @@ from benchmarks.machine import machine
 from hil.estimator.compiled import compiled, inner
 
 Values = NDArray[np.float64]
+LAWS = ("delay", "lag", "logged")
 STEP_S = 2e-5
 SECONDS = {100: 40.0, 200: 20.0, 500: 12.0}
 """Length of a recording by its rate [Hz]."""
@@ -119,17 +123,23 @@ def _rates(state: Values, torque: Values, links: Values, friction: Values) -> Va
 
 
 @compiled
-def _motion(command: Values, interval: float, delay: Values, lag: Values, links: Values, friction: Values) -> Values:
-    """Positions at every command (2, samples) [rad], hanging at first; each command is held, late and filtered."""
+def _motion(command: Values, interval: float, late: Values, links: Values, friction: Values) -> Values:
+    """Positions at every command (2, samples) [rad], hanging at first; each command is held.
+
+    late (3, 2): delay and lag of each joint's torque, and by how much later its position is logged [s].
+    """
     steps = round(interval / STEP_S)
     h, samples = interval / steps, command.shape[1]
     state = np.array([-0.5 * np.pi, 0.0, 0.0, 0.0])
     filtered = command[:, 0].copy()
     position = np.empty((2, samples))
-    for step in range(samples * steps):
-        if step % steps == 0:
-            position[:, step // steps] = state[:2]
+    delay, lag = late[0], late[1]
+    logged = np.array([round(seconds / h) for seconds in late[2]])
+    for step in range(samples * steps + steps):
         for joint in range(2):
+            sample = step - logged[joint]
+            if sample % steps == 0 and 0 <= sample < samples * steps:
+                position[joint, sample // steps] = state[joint]
             # The middle of the step: a change within it acts from its beginning or end, 10 us off at the most.
             at = int(np.floor(((step + 0.5) * h - delay[joint]) / interval))
             goal = command[joint, min(max(at, 0), samples - 1)]
@@ -149,9 +159,12 @@ def measure(seed: int, law: str, longest_ms: float) -> dict[str, Any]:
     arm = drawn_arm(random)
     rate = int(random.choice(list(SECONDS)))
     torque = drawn_torque(random, arm, rate)
-    late, none = 1e-3 * random.uniform(0.0, longest_ms, 2), np.zeros(2)
-    delay, lag = (late, none) if law == "delay" else (none, late)
-    position = _motion(torque, 1.0 / rate, delay, lag, arm.links, arm.friction)
+    seconds = 1e-3 * random.uniform(0.0, longest_ms, 2)
+    if law == "logged":
+        seconds[0] = 0.0
+    late = np.zeros((3, 2))
+    late[LAWS.index(law)] = seconds
+    position = _motion(torque, 1.0 / rate, late, arm.links, arm.friction)
     position += 10.0 ** random.uniform(-4.7, -3.6) * random.standard_normal(position.shape)
     turn = int(random.choice([0, 4096, 65536]))
     if turn:
@@ -169,7 +182,7 @@ def measure(seed: int, law: str, longest_ms: float) -> dict[str, Any]:
     known = {name: each for name, each in found.items() if name in truth}
     return {
         "seed": seed,
-        "late_ms": (1e3 * late).round(2).tolist(),
+        "late_ms": (1e3 * seconds).round(2).tolist(),
         "trust": result["verdict"]["trust"],
         "deviations": {name: (each["value"] - truth[name]) / each["std"] for name, each in known.items()},
         "worst_error": max(abs(each["value"] / truth[name] - 1) for name, each in known.items() if truth[name]),
@@ -182,8 +195,8 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--arms", type=int, default=10)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--law", choices=("delay", "lag"), default="delay")
-    parser.add_argument("--longest", type=float, default=3.0, help="longest delay or lag [ms]")
+    parser.add_argument("--law", choices=LAWS, default="delay")
+    parser.add_argument("--longest", type=float, default=3.0, help="longest of these times [ms]")
     options = parser.parse_args()
     every = []
     for seed in range(options.first, options.first + options.arms):
@@ -192,7 +205,7 @@ def main() -> None:
         if not options.json:
             worst = max(one["deviations"].values(), key=abs)
             print(
-                f'arm {seed}: {options.law}s of {one["late_ms"]} ms, "{one["trust"]}", worst {worst:+.1f} standard '
+                f'arm {seed}: {options.law} {one["late_ms"]} ms, "{one["trust"]}", worst {worst:+.1f} standard '
                 f"errors, {100 * one['worst_error']:.2g} %, {one['cpu_s']:.0f} s",
                 flush=True,
             )

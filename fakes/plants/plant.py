@@ -189,8 +189,8 @@ class CheckedPlant:
                 shape_is_right = numbers_are_right = False
             if not shape_is_right:
                 raise PlantError(
-                    f'plant "{self._name}" at {self._time:g} s: {what} is {values!r}; one number for each of '
-                    f"{self.joints} joints is needed"
+                    f'plant "{self._name}" at {self._time:g} s: {what} is {values!r}; it must be '
+                    f"one number for each of the plant's joints ({self.joints})"
                 )
             if not numbers_are_right:
                 raise PlantError(f'plant "{self._name}" at {self._time:g} s: {what} is {values!r}, which is not finite')

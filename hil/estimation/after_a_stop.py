@@ -19,7 +19,7 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
     if run.result_path.is_file():
         return ["The result is kept; the report is missing.", next_step("report", run.path)]
     if can_be_estimated(run.path):
-        return ["The recording is kept and complete enough for an estimate.", next_step("estimate", run.path)]
+        return ["The recording has been kept and is complete enough for an estimate.", next_step("estimate", run.path)]
     steps = [step for step in _steps(run.path) if can_be_estimated(step)]
     if steps:
         return [
@@ -33,7 +33,7 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
 def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
     """Sentences about what remains after the guard or a failed servo stopped a run; the last gives the next command."""
     if can_be_estimated(run.path):
-        return ["The recording is kept and complete enough for an estimate.", next_step("estimate", run.path)]
+        return ["The recording has been kept and is complete enough for an estimate.", next_step("estimate", run.path)]
     return [f"The recording up to that point is kept in {run.path}.", next_step("check", shown)]
 
 

@@ -235,7 +235,7 @@ def test_plants_that_cannot_be_made(name: str, said: str) -> None:
     ("name", "said"),
     [
         ("Nan", r"at 2 s: velocity is \[nan\], which is not finite"),
-        ("TwoNumbers", r"at 2 s: position is \[0.0, 0.0\]; one number for each of 1 joints"),
+        ("TwoNumbers", r"at 2 s: position is \[0.0, 0.0\]; it must be one number for each of the plant's joints \(1\)"),
     ],
 )
 def test_plants_that_give_no_state(name: str, said: str) -> None:

@@ -285,7 +285,7 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate short.csv", 2, "short.csv: the recording has 2 samples"),
     ("estimate run list.csv", 2, "give either one run folder or recordings"),
     ("estimate arm.toml", 2, "give the folder of a run"),
-    ("estimate arm.toml --out other", 2, "Recordings that hil estimate reads are CSV, Parquet"),
+    ("estimate arm.toml --out other", 2, "To read a recording, hil estimate needs a CSV, Parquet"),
     ("export run --format stl", 2, "'stl' is not a format"),
     ("check arm.yaml", 2, "arm.yaml: judging by its name, it is YAML; hil's files are TOML. `hil init` writes one."),
     ("check mbaud.toml", 2, "port.baud = 1: must be one of 9600,"),
