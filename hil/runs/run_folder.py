@@ -158,8 +158,8 @@ class RunFolder:
         run = cls(path)
         if path.is_file():
             raise RunFolderError(
-                f"{path} is a file: give the folder of a run. To read a recording, hil estimate needs a CSV, Parquet or "
-                "MCAP file, or a ROS 2 bag."
+                f"{path} is a file: give the folder of a run. To read a recording, hil estimate needs a CSV, Parquet "
+                "or MCAP file, or a ROS 2 bag."
             )
         if (path / "recordings.npz").is_file():
             raise RunFolderError(
