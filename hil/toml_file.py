@@ -160,7 +160,7 @@ _HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*(\]\]?)")
 _KEY = re.compile(r"^\s*([\w.\"'-]+)\s*=")
 _NUMBER = r"[-+]?\d[\d_.]*(?:[eE][-+]?\d+)?"
 _SYNTAX = (
-    (rf"{_NUMBER}\s*(?:°|º|deg)", "Angles are plain numbers in rad, without a degree sign or unit: 90 degrees is 1.5708."),
+    (rf"{_NUMBER}\s*(?:°|º|deg)", "Angles are numbers in rad, without a degree sign or unit: 90 degrees is 1.5708."),
     (rf"=\s*{_NUMBER.replace('.', '', 1)},\d+\s*$", "The decimal separator is a point, not a comma: 4.0, not 4,0."),
     (r"[\[,]\s*[-+]?\d+,0\d", "The decimal separator is a point, not a comma: 1.06, not 1,06."),
     (r"[=\[,]\s*(?:True|False|TRUE|FALSE)\b", "Write true or false in lower case."),
