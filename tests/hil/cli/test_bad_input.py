@@ -128,7 +128,7 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate twice.csv", 2, "two columns are named 'q1'"),
     ("estimate binary.csv", 2, "binary"),
     ("estimate backwards.csv", 2, "time goes back"),
-    ("estimate still.csv", 2, "joint 1 moved by 0 rad"),
+    ("estimate still.csv", 2, "the position of joint 1 is always 1 rad"),
     ("estimate unknown.csv", 2, "a, b, c"),
     ("estimate not.parquet", 2, "not.parquet"),
     ("estimate not.mcap", 2, "not.mcap cannot be read: it is not an MCAP file, or it is incomplete or damaged."),

@@ -32,12 +32,15 @@ def test_a_protection_is_named_beside_the_cause_of_a_stop_but_is_none() -> None:
     before = {(SHOULDER, LIMIT): 447, (ELBOW, "Shutdown"): 52}
     alone = {**before, (ELBOW, "Shutdown"): 0}
     assert changed_settings(before, alone, Cause.POSITION) == ""
-    assert "Shutdown is 0 and was 52" in changed_settings(before, alone)
+    assert "Shutdown from 52 to 0" in changed_settings(before, alone)
     assert changed_settings(
         {(ELBOW, "Secondary(Shadow) ID"): 255}, {(ELBOW, "Secondary(Shadow) ID"): 1}, Cause.POSITION
     )
     both = {**alone, (SHOULDER, LIMIT): 100}
-    assert all(each in changed_settings(before, both, Cause.POSITION) for each in ("Shutdown is 0", "Limit is 100"))
+    assert all(
+        each in changed_settings(before, both, Cause.POSITION)
+        for each in ("Shutdown from 52 to 0", "Limit from 447 to 100")
+    )
 
 
 class Late:
