@@ -3,8 +3,8 @@
 Current mode and PWM mode have different goal registers. Each is written by its own Sync Write; all are sent in the same
 write to the port.
 
-A Sync Write has no reply, so the group read that follows it can be sent in the same write: one adapter transaction
-instead of two. All packets are prepared in advance; a cycle only packs the goals and computes one CRC.
+A Sync Write has no reply, so the group read that follows it can be sent in the same write, which takes one adapter
+transaction instead of two. All packets are prepared in advance; a cycle only packs the goals and computes one CRC.
 
 The registers that are read vary from cycle to cycle. Most cycles read `spans[0]`. Every `slow_every`-th cycle reads one
 of the other spans, in turn; every `status_every`-th cycle reads `status`, the registers that show whether torque is
@@ -90,7 +90,7 @@ class Exchange:
     one_write: send both packets in one write instead of two.
     slow_every: number of cycles between two reads of a slow span, i.e. one of `spans[1:]`.
     status_every: number of cycles between two status reads; there are none if `status` is None.
-    interval: time between two cycles [s], 0 if unknown; a slow cycle can wait longer for a reply than a fast one.
+    interval: time between two cycles [s], 0 if unknown; the longer it is, the longer a cycle can wait for a reply.
     patience: minimum time to wait for replies [s]; by default the longest time that wire, servos and adapter may need.
     beside: registers that are read back between cycles; a late reply to such a read is recognised by its length, too.
     """

@@ -113,7 +113,7 @@ class ServoModel:
     watchdog_firmware: first firmware with a Bus Watchdog.
     fast_sync_read_firmware: first firmware that supports Fast Sync Read; None if none does.
     senses_supply: whether Present Current is the supply current, that is, the motor current times the bridge's duty
-    cycle, which is far less than the commanded current while the joint is slow. This is true of the 330 series
+    cycle, which is far less than the commanded current while the joint moves slowly. This is true of the 330 series
     (e-Manual, Current Limit: the XL330 "measures current at its input power source").
     """
 

@@ -135,7 +135,7 @@ class FakeBus:
     # The host's side
 
     def write(self, data: bytes) -> None:
-        """Put bytes on the wire, after those still being sent. They are lost if the cable is unplugged."""
+        """Put bytes on the wire, after those still being sent. The new bytes are lost if the cable is unplugged."""
         wire, receiver = self._wire, self._receiver
         now = self.clock.now()
         if now - self._origin >= self.faults.next_change:

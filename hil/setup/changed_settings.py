@@ -73,8 +73,8 @@ def settings_now(bus: ServoBus) -> Settings:
     """Read the settings that determine how servos move, what they report and when they protect themselves.
 
     Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
-    to an earlier request. If the two readings differ, the value is unknown and omitted. So are all values of a servo
-    whose ID is read wrongly: its replies are late, and equal values may be those of other registers.
+    to an earlier request. If the two readings differ, the value is unknown and omitted, as are all values of a
+    servo whose ID is read wrongly: its replies are late, and equal values may be those of other registers.
     """
     found: dict[tuple[Joint, str], int] = {}
     report = bus.torque_off_report
