@@ -73,7 +73,7 @@ class ServoBus(TorqueSwitch):
         with ServoBus.open(BusConfig("/dev/ttyUSB0", 1_000_000, joints)) as bus, bus.torque(watchdog=0.1):
             state = bus.exchange([0.1, 0.0])
 
-    After any error, the same object can still cut torque; `torque_off_report` then says whether that succeeded.
+    After any error, the same object can still cut torque; `torque_off_report` then shows whether that succeeded.
     """
 
     def __init__(self, port: Port, config: BusConfig) -> None:
@@ -90,7 +90,7 @@ class ServoBus(TorqueSwitch):
         """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
         self._exchange: Exchange | None = None
         self.exchanges_per_sample = 1
-        """Number of exchanges per sample, at most CHECK_S apart if the bus is fast enough; set by `prepare`.
+        """Number of exchanges per sample, set by `prepare`: they are at most CHECK_S apart if the bus is fast enough.
         """
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._last_answers: Sequence[Answer] = ()
@@ -145,7 +145,7 @@ class ServoBus(TorqueSwitch):
     def check_identity(self) -> None:
         """Ping every servo and compare its model and firmware with the configuration; raises NoReply, WrongModel.
 
-        Also lowers the adapter's latency timer and measures whether the adapter is slower than its type suggests.
+        Also lowers the adapter's latency timer and determines whether the adapter is slower than expected for its type.
         """
         self.port.lower_latency()
         learn_latency(next(iter(self._servos.values())))
@@ -222,7 +222,7 @@ class ServoBus(TorqueSwitch):
         self._exchange = exchange
 
     def add_read_back(self, exchange: Exchange) -> None:
-        """Make an exchange with these servos read back their goals, Torque Enable and settings, as these are now."""
+        """Make `exchange` read back the servos' goals, Torque Enable and settings; expect the present settings."""
         modes = [drive.mode for drive in self._drives]
         settings = [[servo.read(name) for name in SETTINGS] for servo in self._servos.values()]
         exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in self._servos.values()]), settings)
@@ -300,7 +300,7 @@ class ServoBus(TorqueSwitch):
         """Send goals, one per joint [A, or V in PWM mode], and return the arm's state.
 
         between: whether this exchange lies between two samples (`Exchange.cycle`).
-        A servo that does not reply is marked as missing. Raises PortLost; BusOverheard if packets of another master
+        A servo that does not reply is marked as missing. Raises PortLost; BusOverheard if packets from another master
         are heard repeatedly; WrongReply if servos repeatedly answer with each other's ID; ValueError for a goal that is
         not a finite number.
         """
@@ -320,8 +320,8 @@ class ServoBus(TorqueSwitch):
     def first_hides_others(self, patience: float) -> bool:
         """Whether only the first servo is silent and masks the replies of the others. Raises PortLost.
 
-        In a group read, a silent servo masks the replies of those after it. This therefore reads the last servo, then
-        the first. patience: how long to wait for their replies [s].
+        In a group read, a silent servo masks the replies of those after it. The last servo is therefore read first,
+        then the first servo. patience: how long to wait for their replies [s].
         """
         drives = (self._drives[-1], self._drives[0])
         read = SyncRead([each.id for each in drives], Span.of([self._servos[each].table for each in drives], ["ID"]))
@@ -341,7 +341,7 @@ class ServoBus(TorqueSwitch):
 
     @property
     def watchdog_changed(self) -> tuple[int, int] | None:
-        """Index of a joint whose Bus Watchdog, as last read back, is not as armed, and its value [20 ms]; else None.
+        """Index of a joint whose Bus Watchdog was last read back as changed, and its value [20 ms]; otherwise None.
 
         A tripped watchdog is not included: its cause depends on how long no packets were sent.
         """
@@ -358,13 +358,13 @@ class ServoBus(TorqueSwitch):
         return None if place is None else self._of[place]
 
     def read_torque(self) -> int | None:
-        """Read Torque Enable of all servos now, as it is before torque is cut; return as `torque_lost`."""
+        """Read Torque Enable of all servos now, before torque is cut; return the same as `torque_lost`."""
         self.prepared.read_torque()
         return self.torque_lost
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """Index of a joint that has missed many of the latest goals, and text with the value read back; else None."""
+        """Index of a joint that has missed many of the latest goals, and a text with the value read back; or None."""
         if (lost := self.prepared.lost) is None:
             return None
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"

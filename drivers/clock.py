@@ -15,7 +15,7 @@ class Clock(Protocol):
     """A monotonic clock, in seconds, that can wait until a given time."""
 
     def now(self) -> float:
-        """Return the seconds since an arbitrary start; never decreases."""
+        """Return the seconds since an arbitrary start; the value never decreases."""
         ...
 
     def wait_until(self, deadline: float) -> None:

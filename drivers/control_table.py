@@ -1,6 +1,7 @@
 """Control tables: the registers of each servo model and their addresses.
 
-They are read from the `.model` files of the `dynamixel-sdk` package (one per model, tab-separated), not copied here.
+The tables are not copied here but read from the `.model` files of the `dynamixel-sdk` package (one per model,
+tab-separated).
 """
 
 from collections.abc import Mapping
@@ -32,7 +33,7 @@ _SIGNED = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """One entry of a control table; `size` in bytes."""
+    """One entry of a control table; `size` is in bytes."""
 
     name: str
     address: int

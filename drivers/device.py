@@ -45,9 +45,9 @@ def _leads_to(link: Path, wanted: str) -> bool:
 
 
 def true_baud(descriptor: int) -> int | None:
-    """Return the baud rate at which the driver runs the device; None if the system does not say.
+    """Return the baud rate at which the driver runs the device; None if the system does not report it.
 
-    A driver does not refuse a rate that its adapter does not support, but sets another one.
+    A driver does not refuse a rate that its adapter does not support; it sets another one instead.
     """
     speeds = bytearray(_SPEEDS.size)
     try:
@@ -58,7 +58,7 @@ def true_baud(descriptor: int) -> int | None:
 
 
 def adapter_name(device: str, sysfs: Path = _SYSFS) -> str:
-    """Return a persistent name for a device's USB adapter: replugging may change the device, but not this name.
+    """Return a persistent name for a device's USB adapter: replugging may change the device path, but not this name.
 
     Returns "" if the adapter has no serial number, or if another adapter that is plugged in has the same one.
     """
@@ -72,7 +72,7 @@ def adapter_name(device: str, sysfs: Path = _SYSFS) -> str:
 
 
 def device_of(name: str, sysfs: Path = _SYSFS) -> str | None:
-    """Return the current device of the adapter with this persistent name; None if it is not plugged in."""
+    """Return the current device path of the adapter with this persistent name; None if it is not plugged in."""
     ports = sysfs / "class" / "tty"
     found = [each for pattern in _USB_PORTS for each in ports.glob(pattern) if _identity(each / "device") == name]
     return f"/dev/{found[0].name}" if name and len(found) == 1 else None

@@ -50,7 +50,7 @@ class UnknownModel(DriverError):
 
 
 class PortNotOpened(DriverError):
-    """The port could not be opened. Example: the adapter is unplugged, or another program has the port."""
+    """The port could not be opened. Example: the adapter is unplugged, or another program has the port open."""
 
 
 class NotPermitted(PortNotOpened):

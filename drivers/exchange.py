@@ -3,8 +3,8 @@
 Current mode and PWM mode have different goal registers. Each is written by its own Sync Write; all are sent in the same
 write to the port.
 
-A Sync Write has no reply, so the group read that follows it can be sent in the same write: one adapter transaction
-instead of two. All packets are prepared in advance; a cycle only packs the goals and computes one CRC.
+A Sync Write has no reply, so the group read that follows it can be sent in the same write, which takes one adapter
+transaction instead of two. All packets are prepared in advance; a cycle only packs the goals and computes one CRC.
 
 The registers that are read vary from cycle to cycle. Most cycles read `spans[0]`. Every `slow_every`-th cycle reads one
 of the other spans, in turn; every `status_every`-th cycle reads `status`, the registers that show whether torque is
@@ -54,7 +54,7 @@ many cycles late is recognised by its length.
 """
 
 _LATE_SHARE = 0.25
-"""Fraction of the time by which a read-back may delay a cycle for which every read-back may be late."""
+"""Fraction of `Exchange._overtime` by which the reply to any read-back may be late."""
 
 _LONGEST_REPLY = 1024
 _DOUBTS = 3
@@ -90,7 +90,7 @@ class Exchange:
     one_write: send both packets in one write instead of two.
     slow_every: number of cycles between two reads of a slow span, i.e. one of `spans[1:]`.
     status_every: number of cycles between two status reads; there are none if `status` is None.
-    interval: time between two cycles [s], 0 if unknown; a slow cycle can wait longer for a reply than a fast one.
+    interval: time between two cycles [s], 0 if unknown; the longer it is, the longer a cycle can wait for a reply.
     patience: minimum time to wait for replies [s]; by default the longest time that wire, servos and adapter may need.
     beside: registers that are read back between cycles; a late reply to such a read is recognised by its length, too.
     """
@@ -151,7 +151,7 @@ class Exchange:
         self._doubts = _DOUBTS
         self._turns = Turns(len(spans) - 1, slow_every, NEVER if status is None else status_every)
         self._usual_left = self._turns.plan()
-        """Number of remaining cycles that read the usual span before another one may be due."""
+        """Number of remaining cycles that read the usual span before another span may be due."""
         self._late_possible = False
         self._after_loss = 0
         self._cut_off = b""
@@ -165,7 +165,7 @@ class Exchange:
         shown = () if status is None else one_each(status, len(self.ids))[0].registers
         self._shows_torque = "Torque Enable" in shown
         self._overtime = 0.0 if self._shows_torque else OVERTIME_SHARE * interval
-        """By how much a read-back may delay the next cycle [s]: not at all if a status shows the same."""
+        """Longest time by which a read-back may delay the next cycle [s]; 0 if the status includes Torque Enable."""
         self.awaited_until = -math.inf
         """Reply deadline of the latest repeated read-back, which may delay the next cycle [s on the port's clock]."""
         self.read_back_at = math.inf
@@ -213,7 +213,7 @@ class Exchange:
                 plan.read.in_any_order = True
 
     def read_status_next(self) -> None:
-        """Read the status in the next cycle instead of when it is due."""
+        """Read the status in the next cycle instead of waiting until it is due."""
         self._turns.count(self._usual_left)
         self._turns.read_status_next()
         self._usual_left = self._turns.plan()
@@ -266,7 +266,7 @@ class Exchange:
         return None if self._read_back is None else self._read_back.torque_off
 
     def read_torque(self) -> int | None:
-        """Read Torque Enable of all servos now, outside a cycle; return as `torque_off`. Raises PortLost."""
+        """Read Torque Enable of all servos now, outside a cycle; return the same as `torque_off`. Raises PortLost."""
         back = self._read_back
         if back is not None and not self._late_possible:
             back.kind, now = TORQUE, self._now()
@@ -274,10 +274,10 @@ class Exchange:
         return self.torque_off
 
     def read_back_every(self, off_wire: float) -> tuple[float, float]:
-        """Expected time between two read-backs of a goal [s], 0 if most cycles leave time for one; and the shortest
-        cycle that does [s].
+        """Return the expected time between two read-backs of a goal [s] (0 if most cycles leave time for one), and the
+        duration of the shortest cycle that leaves time for one [s].
 
-        off_wire: what an exchange takes in addition to its time on the wire [s].
+        off_wire: duration of an exchange in addition to its wire time [s].
         """
         back = self._read_back
         if back is None or not self._interval:
@@ -292,7 +292,7 @@ class Exchange:
 
     @property
     def lost(self) -> Overruled | None:
-        """A servo that has missed many of the latest goals, according to read-backs; else None."""
+        """A servo that, according to read-backs, has missed many of the latest goals; None if there is none."""
         return self._read_back.lost if self._read_back is not None else None
 
     def overruled(self, due: float) -> Overruled | None:
@@ -322,9 +322,9 @@ class Exchange:
         return self._wire_s[read] + max(off_wire, back.longest)
 
     def _held(self, back: ReadBack, due: float) -> Overruled | None:
-        """Read back once if this is possible before `due` [s], or slightly later if it is overdue.
+        """Read back once if this is possible before `due` [s], or slightly later if a read-back is overdue.
 
-        If there is no time for all servos, one is read.
+        If there is no time for all servos, only one is read.
         """
         port, now, read = self._port, self._now(), back.read
         takes = self._takes(read, back)
@@ -435,7 +435,7 @@ class Exchange:
         return _reply((before, after, plan.span, servos))
 
     def _look_again(self, plan: "_Plan", received: bytes, servos: list[Answer] | None, before: float) -> list[Answer]:
-        """Return the answers to a request whose reply is irregular (`servos` is None) or came too soon."""
+        """Return the answers in a reply that is irregular (`servos` is None) or arrived too soon."""
         deadline = before + plan.reply_time.timeout
         if servos is not None:
             return self._latest(plan.read, servos, deadline)

@@ -130,8 +130,8 @@ def _seal(packet_id: int, payload: bytes) -> bytes:
 class Framer:
     """Finds packets in a stream of bytes and resynchronises after noise.
 
-    A packet whose CRC does not match is counted in `bad_crc`. The host then searches for a header from the next byte
-    on, since the length itself may be corrupted. With `damaged=True` the framer behaves like a servo: it trusts the
+    A packet whose CRC does not match is counted in `bad_crc`. The search for a header then resumes at the next
+    byte, since the length itself may be corrupted. With `damaged=True` the framer behaves like a servo: it trusts the
     length and returns the packet marked as damaged, because a servo answers it with an error.
     A LEN above `longest` is treated as noise.
     """

@@ -1,4 +1,4 @@
-"""Replacements for two classes of `dynamixel-sdk`: a port handler on top of our open port, and a packet handler that
+"""Replacements for two classes of `dynamixel-sdk`: a port handler on top of an open `Port`, and a packet handler that
 finds a reply despite preceding noise.
 """
 
@@ -19,10 +19,10 @@ _BEFORE_LENGTH, _FRONT = 7, 8
 
 
 class SdkPort:
-    """Adapts our open port to `dynamixel-sdk`, removing the echo of an adapter that receives its own transmissions.
+    """Adapts an open `Port` to `dynamixel-sdk`, removing the echo of an adapter that receives its own transmissions.
 
-    Unlike in the SDK's own port, reads block instead of polling, and time is the port's clock. A failure cannot leave
-    the port marked as in use, which would keep torque from being cut. The method names are the SDK's.
+    Unlike in the SDK's own port, reads block instead of polling, and time is that of the port's clock. A failure cannot
+    leave the port marked as in use, which would keep torque from being cut. The method names are the SDK's.
     """
 
     def __init__(self, port: Port) -> None:

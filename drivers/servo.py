@@ -103,7 +103,7 @@ class Servo:
         """Write a register and read it back. Raises the same errors as `read`, and ServoRefused if another value is
         read back.
 
-        attempts: maximum number of attempts at the write, and then at the read; the default is that of all set-up work.
+        attempts: maximum number of attempts at the write, and then at the read; by default, that of all set-up work.
         """
         self._write_and_read_back(register, value, attempts, despite_error=False)
 

@@ -58,7 +58,7 @@ replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
 """
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
-"""Baud rates by the value of the register Baud Rate. The 330 models only go up to 4 MBd."""
+"""Baud rates, indexed by the value of the register Baud Rate. The 330 models only go up to 4 MBd."""
 
 
 class Mode(IntEnum):
@@ -113,7 +113,7 @@ class ServoModel:
     watchdog_firmware: first firmware with a Bus Watchdog.
     fast_sync_read_firmware: first firmware that supports Fast Sync Read; None if none does.
     senses_supply: whether Present Current is the supply current, that is, the motor current times the bridge's duty
-    cycle, which is far less than the commanded current while the joint is slow. This is true of the 330 series
+    cycle, which is far less than the commanded current while the joint moves slowly. This is true of the 330 series
     (e-Manual, Current Limit: the XL330 "measures current at its input power source").
     """
 

@@ -86,7 +86,7 @@ def spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[
     """Return the registers read in most cycles, and two longer spans read occasionally.
 
     The second span adds the servo's clock, the third the supply voltage and temperature. mode: drive mode of all
-    servos, or of each.
+    servos, or one per servo.
     """
     return (
         _span(mode, tables, (), ()),
@@ -115,8 +115,8 @@ _DRIVEN = ("Torque Enable", "Hardware Error Status")
 def status_span(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable], *, whole: bool) -> Spans:
     """Return the registers that show whether torque and watchdog are still on, plus the state.
 
-    mode: drive mode of all servos, or of each. whole: start at Torque Enable; otherwise start at Bus Watchdog, which
-    halves the number of bytes.
+    mode: drive mode of all servos, or one per servo. whole: start at Torque Enable; otherwise start at Bus Watchdog,
+    which halves the number of bytes.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
     names = [(*_DRIVEN, *_status_names(own)) if whole else _status_names(own) for own in modes]
@@ -194,7 +194,7 @@ class Converter:
         return self._any_state(tuple(map(operator.mul, self._drive_units, ticks)), reply)
 
     def _any_state(self, sent: tuple[float, ...], reply: Reply) -> State:
-        """Convert a reply as `state` does, but for any span, and even if answers are missing or refused."""
+        """Convert a reply as `state` does, but for any span, and even if servos did not reply or refused."""
         # Additional registers precede the three that are always read, but voltage and temperature follow them.
         at = 1 if reply.span in (0, SLOW_SPANS) else 2 if reply.span == 1 else self._answer_length(reply) - 3
         drive, velocity, position, error, missing = [], [], [], [], []

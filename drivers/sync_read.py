@@ -126,14 +126,14 @@ class GroupRead(Protocol):
 class SyncRead:
     """A Sync Read: each servo answers with its own status packet, in the order of `ids`.
 
-    span: the registers to read, one span for all servos or one per servo (`Span.each`). The latter cover the same
-    addresses but decode different values.
+    span: the registers to read, one span for all servos or one per servo (`Span.each`). The spans of different
+    servos cover the same addresses but decode different values.
     """
 
     def __init__(self, ids: Sequence[int], span: Span | Sequence[Span]) -> None:
         self._ids = tuple(ids)
         self.in_any_order = False
-        """Whether answers are accepted in any order, as when only some of them are late."""
+        """Whether answers are accepted in any order, as needed if only some of them are late."""
         spans = one_each(span, len(self._ids))
         self._values = {servo_id: Struct(f"<B{own.format}") for servo_id, own in zip(ids, spans, strict=True)}
         span = spans[0]

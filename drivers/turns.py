@@ -12,8 +12,8 @@ class Turns:
     A cycle only decrements the number of usual cycles returned by `plan`, from which `count` derives how many have
     passed.
 
-    slow_spans: number of slow spans. slow_every: samples between two of them. status_every: cycles between two status
-    reads.
+    slow_spans: number of slow spans. slow_every: samples between two slow reads. status_every: cycles between two
+    status reads.
     """
 
     def __init__(self, slow_spans: int, slow_every: int, status_every: int) -> None:

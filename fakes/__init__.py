@@ -18,7 +18,7 @@ def register_for(url: str) -> None:
 
 
 def allow_code(allowed: bool = True) -> None:
-    """Allow (or forbid) [fake] tables opened from now on to call functions of other packages through `plant`.
+    """Set whether [fake] tables opened from now on may call functions of other packages through `plant`.
 
     See `hil.fakes.plants.plant` for why this is off by default.
     """

@@ -45,7 +45,7 @@ class FakeSerial(SerialBase):
     The arm is created when the port is first opened and lives as long as the port object. Two port objects never share
     an arm.
 
-    It has the attributes `clock` and `bus` in addition to pyserial's interface.
+    A port has the attributes `clock` and `bus` in addition to pyserial's interface.
     """
 
     def __init__(
@@ -177,13 +177,13 @@ class FakeSerial(SerialBase):
         return _Unplugged()
 
     def _update_rts_state(self) -> None:
-        """Ignore: this port has no RTS line. pyserial calls this when the setting changes."""
+        """Do nothing: this port has no RTS line. pyserial calls this when the setting changes."""
 
     def _update_dtr_state(self) -> None:
-        """Ignore: this port has no DTR line. pyserial calls this when the setting changes."""
+        """Do nothing: this port has no DTR line. pyserial calls this when the setting changes."""
 
     def _update_break_state(self) -> None:
-        """Ignore: this port has no break state. pyserial calls this when the setting changes."""
+        """Do nothing: this port has no break state. pyserial calls this when the setting changes."""
 
 
 def open_fake(

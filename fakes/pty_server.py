@@ -29,8 +29,7 @@ OVERRUN_S = 1e-3
 """A reply delivered more than this long after it was due counts as a real-time overrun [s]."""
 
 TOO_SLOW_S = 5e-3
-"""If simulating the arm takes this much longer than the simulated time twice in a row, the excess is not simulated [s].
-"""
+"""If simulation takes longer than the simulated time by more than this twice in a row, the excess is skipped [s]."""
 
 LONGEST_SLEEP_S = 0.05
 """Longest wait before the server checks for faults, watchdog trips and a request to stop [s]."""

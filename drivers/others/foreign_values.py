@@ -1,4 +1,4 @@
-"""Detection of servo values that this program cannot have written and that are read too often to be chance."""
+"""Detection of servo values that this program cannot have written and that are read too often for this to be chance."""
 
 from collections import deque
 

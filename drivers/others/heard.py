@@ -23,7 +23,7 @@ _LONGEST_CUT_OFF = 64
 """Largest LEN of a truncated instruction that is recognised as such; a damaged LEN is usually larger."""
 
 _LEAST_REPEATED = 4
-"""Number of bytes from which part of a reply is recognised when it arrives again."""
+"""Minimum length of part of a reply that is recognised when it arrives again [bytes]."""
 
 _PART_OF_A_REPLY = 8  # bytes; at least the header of a fast reply, whose first servos have then answered
 
@@ -40,14 +40,14 @@ class Heard:
         self.expect(reads)
         self.damaged_at = self.late_at = self.repeated_at = -math.inf
         """Times of the latest incomplete or damaged replies, of the latest late or repeated reply, and of the latest
-        reply that arrived again [s on the port's clock].
+        reply that was certainly a repetition [s on the port's clock].
         """
         self.latest = b""
         """What was received in reply to the latest request."""
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """Number of replies since the last late one that had one answer per servo but IDs not matching the request."""
+        """Number of replies, since the last late one, with one answer per servo but IDs not matching the request."""
         self.strangers: float = 0
         """Number of received packets that this program neither sent nor requested, but another master did."""
 
@@ -133,7 +133,10 @@ class Heard:
             self.strangers += sum(self._is_strange(packet) for packet in packets)
 
     def _is_strange(self, packet: Packet) -> bool:
-        """Whether this is another master's instruction or a reply to one. An error without data may be for us."""
+        """Whether this is another master's instruction or a reply to one.
+
+        An error without data may be a reply to this program.
+        """
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
@@ -171,7 +174,7 @@ def _fronts_of_replies(received: bytes) -> Iterator[tuple[int, int]]:
 def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:
     """Yield the ID and LEN of each instruction that is cut off by the next packet.
 
-    A master does not receive while it transmits: it hears only the part of another's packet that preceded its own.
+    A master does not receive while it transmits: it hears only the part of a foreign packet that precedes its own.
     """
     at = received.find(HEADER)
     while (following := received.find(HEADER, at + len(HEADER))) >= 0:

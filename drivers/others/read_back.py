@@ -24,13 +24,13 @@ modes are read.
 """
 
 _GOALS_PER_OTHER_IN_DOUBT = 4
-"""Minimum number of goal read-backs between two others while a foreign value is suspected."""
+"""Minimum number of goal read-backs between two other read-backs while a foreign value is suspected."""
 
 _RECENT = 4
 """Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
 
 REMEMBERED = 128
-"""Like `_RECENT`, but before the status has detected the loss."""
+"""Number of recent goals that a servo may still hold until the status detects that writes are lost."""
 
 _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Numbers of read-backs of a foreign value that prove another writer, and the time within which they must occur [s].
@@ -49,18 +49,19 @@ TRY_AGAIN_S = 0.005
 _AGAIN_SHARE = 0.5
 _SHORT_CYCLE_S = 0.005
 """In cycles of up to `_SHORT_CYCLE_S` [s], a lost read-back is repeated at once, which may delay the next cycle by the
-share `_AGAIN_SHARE` of one. In longer ones, read-backs are rarely destroyed, and a delay leaves joints unobserved.
+fraction `_AGAIN_SHARE` of a cycle. In longer cycles, read-backs are rarely destroyed, and a delay would leave joints
+unobserved.
 """
 
 OVERDUE_S, OVERTIME_SHARE = 0.075, 0.8
 """If nothing was read back for `OVERDUE_S` [s] because cycles leave no time for it, a read-back may delay the next
-cycle by up to this fraction of a cycle: otherwise a disarmed watchdog or lost torque would never be seen. Every fourth
-one is of Torque Enable.
+cycle by up to the fraction `OVERTIME_SHARE` of a cycle; otherwise, a disarmed watchdog or lost torque would never be
+detected. Every fourth such read-back is of Torque Enable.
 """
 
 _DELAYED_SHARE, _DELAYED_SHARE_IN_DOUBT = 0.01, 0.1
-"""Fraction of the time by which overdue read-backs may delay cycles; the second while a foreign value is suspected.
-Where they delay a cycle only a little, they are thus made more often than every `OVERDUE_S`.
+"""Ratio of the delay caused by an overdue read-back to the longest time until the next one; the second value applies
+while a foreign value is suspected. If the delay is short, read-backs are thus made more often than every `OVERDUE_S`.
 """
 
 LOST_GOALS, LOST_OF = 3, 6
@@ -98,10 +99,10 @@ class ReadBack:
 
     goal: a span of Bus Watchdog and goal. mode: a span that ends with the settings; `modes` are their values, the
     same number for each servo. A change to one of these settings reverses the motor, shifts every angle, or changes the
-    meaning of goals. torque: a span that begins with Torque Enable. watches_torque: whether it is read back regularly,
-    since no status shows it. interval: time between two cycles [s], 0 if unknown.
+    meaning of goals. torque: a span that begins with Torque Enable. watches_torque: whether Torque Enable is read
+    back regularly, as is necessary if no status shows it. interval: time between two cycles [s], 0 if unknown.
 
-    If a cycle leaves no time to read all servos, one of them is read (`alone`), in turn.
+    If a cycle leaves no time to read all servos, only one is read (`alone`); the servos take turns.
 
     Every cycle overwrites the goals of another master. A master that writes less often than this program is therefore
     detected only if the goals are read before every cycle.
@@ -159,7 +160,7 @@ class ReadBack:
         self.torque_off: int | None = None
         """Index of a servo whose Torque Enable read 0 when it was last read back; None if there is none."""
         self.overdue_at = math.inf
-        """Time from which a read-back may delay a cycle if nothing is read back before [s]."""
+        """Time from which a read-back may delay a cycle if nothing is read back before then [s]."""
         self.doubts_until = -math.inf
         self.sighted: Overruled | None = None
         """The latest value read back that this program did not write; it is treated as recent until `doubts_until`."""
@@ -192,9 +193,9 @@ class ReadBack:
         self.overdue_at = min(self.overdue_at, now + OVERDUE_S)
 
     def delayed(self, now: float, delay: float, *, alone: bool) -> None:
-        """Process that a read-back has delayed the next cycle by `delay` [s]; 0 if it has not.
+        """Account for a read-back that has delayed the next cycle by `delay` [s]; 0 if it has not.
 
-        alone: whether only one servo was read, which counts as its share of a read-back of all.
+        alone: whether only one servo was read, which counts as the corresponding share of a read-back of all.
         """
         if delay == 0.0 and self._was_of_goals and now >= min(self._due.values()):
             return  # what is due did not fit
@@ -204,7 +205,7 @@ class ReadBack:
         self.overdue_at = min(due, now + pause)
 
     def may_repeat(self, now: float, takes: float) -> bool:
-        """Whether to repeat a lost read-back, which takes `takes` [s], at once."""
+        """Whether to repeat at once a lost read-back that takes `takes` [s]."""
         if takes >= self._longest_again or now <= self._repeated_at + TRY_AGAIN_S:
             return False
         self._repeated_at = now
@@ -316,7 +317,7 @@ class ReadBack:
         ]
 
     def _other_settings(self, servos: Sequence[Answer]) -> list[Overruled]:
-        """Return the first setting of each servo that differs from what this program wrote or found."""
+        """Return, for each servo, the first setting that differs from what this program wrote or found."""
         found = []
         for place, (answer, modes) in enumerate(zip(servos, self._modes, strict=True)):
             if answer is None or answer[-len(modes) :] == modes:
@@ -326,7 +327,7 @@ class ReadBack:
         return found
 
     def _count_missed(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> None:
-        """Count the goals that did not arrive: the servo still holds an earlier goal of this program."""
+        """Count goals that did not arrive, i.e. servos that still hold an earlier goal from this program."""
         before = list(islice(reversed(sent), 1, _RECENT))
         for place, (answer, missed) in enumerate(zip(servos, self._missed, strict=True)):
             if answer is None or answer[-1] == sent[-1][place] or all(answer[-1] != each[place] for each in before):

@@ -25,7 +25,7 @@ the supply current, which is slow to reveal a loss of torque.
 def cadence(
     sample: float, port: Port, drives: Sequence[Joint], tables: Sequence[ControlTable], return_delay: float
 ) -> tuple[int, Spans | None, int]:
-    """Return the number of exchanges per sample, the status registers, and how many exchanges apart to read them.
+    """Return the exchanges per sample, the status registers, and the number of exchanges between two reads of these.
 
     The registers are None if there is no time to read them. sample: time between two samples [s], 0 if unknown. drives:
     one entry per servo. return_delay: the servos' longest Return Delay Time [s].

@@ -63,7 +63,7 @@ def learn_latency(servo: Servo) -> None:
 
 
 def _trips(servo: Servo) -> list[float]:
-    """Return the durations of a few pings [s], up to the first without a reply."""
+    """Return the durations of a few pings [s], stopping at the first without a valid reply."""
     clock, trips = servo.port.clock, []
     with suppress(NoReply, WrongReply):
         for _ in range(_TRIPS):
@@ -106,7 +106,7 @@ def overruled(joint: Joint, found: Overruled) -> BusShared:
 
 
 def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
-    """Prepare a servo without torque: no fault, settings that permit an experiment, and the joint's operating mode.
+    """Prepare a servo whose torque is off: check it for faults and unsuitable settings, and set its operating mode.
 
     others: IDs of the arm's other servos. Raises ServoFault, WrongSetting, and the errors of `Servo.write`.
     """

@@ -27,19 +27,19 @@ PROTECTIVE = (
     "PWM Slope",
     SECONDARY_ID,
 )
-"""EEPROM registers that decide when a servo protects itself and whom it obeys. An experiment does not set them, but
-restores them if another program has changed them meanwhile.
+"""EEPROM registers that determine when a servo protects itself and which IDs it obeys. An experiment does not set
+them, but restores them if another program has changed them in the meantime.
 
 Other writable EEPROM registers are not restored:
 - PWM Limit, Drive Mode, Homing Offset, Return Delay Time: the user may have wanted the change, and restoring it
-  unasked would change what angles and goals mean. It is reported, with the former value.
+  unasked would change what angles and goals mean. The change is reported, with the former value.
 - ID, Baud Rate, Protocol Type: after a change, the servo no longer answers; the guard reports this.
-- Startup Configuration: the SDK's tables lack it; the next start refuses a servo that switches its torque on itself.
+- Startup Configuration: the SDK's tables lack it; the next start refuses a servo that switches its torque on by itself.
 - Moving Threshold, External Port Mode: they affect neither the motion nor the replies that this program uses.
 """
 
 EEPROM = ("Current Limit", "Operating Mode", *PROTECTIVE)
-"""EEPROM registers that are restored, in this order, since the limit bounds the goal."""
+"""EEPROM registers to restore, in this order; Current Limit comes first because it bounds Goal Current."""
 
 # Not in it: LED, which only shines; Torque Enable, which is cut; Goal Position (see above).
 RAM = (

@@ -24,7 +24,7 @@ def is_held(servo: Servo) -> bool:
     """Return whether the servo's torque is on and holds or drives its joint. Raises the same errors as `Servo.read`.
 
     A tripped Bus Watchdog has zeroed the goal, so that in current and PWM mode the joint moves freely. Torque Enable is
-    read twice, because a reply does not say which register it is for.
+    read twice, because a reply does not identify its register.
     """
     if not (servo.read("Torque Enable") and servo.read("Torque Enable")):
         return False
@@ -59,7 +59,7 @@ def _current(joint: Joint, servo: Servo) -> str:
 def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
     """Ramp the output of held servos down to zero, wait until the joints no longer sink, then cut torque.
 
-    With zero PWM and torque on, the motor's terminals are shorted and it brakes. Raises the same errors as
+    With zero PWM and torque on, the motor's terminals are shorted, so it brakes. Raises the same errors as
     `Servo.write`.
     """
     held = {joint: servo for joint, servo in servos.items() if is_held(servo)}

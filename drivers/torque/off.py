@@ -1,9 +1,9 @@
 """Cutting torque: torque off is sent to every servo and read back, regardless of failures and interrupts.
 
 The order matters. Every packet feeds the Bus Watchdog of every servo that receives it, whatever ID it addresses. If a
-servo receives but does not obey, because it refuses instructions or its ID has changed, only that watchdog stops its
+servo receives packets but does not obey, because it refuses them or its ID has changed, only its watchdog stops its
 current. So torque off is first sent to all servos at once, which takes 0.3 ms; then each servo is polled until one does
-not reply. From then on, the bus stays silent until the Bus Watchdogs time out. If a servo was already silent before
+not reply. From then on, the bus stays silent until the Bus Watchdogs time out. If a servo is already silent before
 torque is cut, torque off is sent three times, since a packet may be lost, and the silence begins at once. After the
 silence, all servos not yet confirmed are polled again, several times.
 
@@ -31,7 +31,7 @@ from hil.drivers.servo_model import WATCHDOG_UNIT, Mode
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _INTERRUPTS_BORNE = 5
-"""Number of attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
+"""Number of interrupted attempts (Ctrl-C) after which confirming torque off for a servo counts as failed."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
 """Maximum delay of a watchdog beyond its timeout [s], since it counts in steps of 20 ms."""
@@ -48,8 +48,8 @@ class TorqueOff:
     unconfirmed: the other joints, each with the reason.
     unwatched: joints, of either group, whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
-    rebooted: confirmed joints whose servos were reset, and so lost the watchdog that was armed before torque came on.
-    disarmed: confirmed joints whose servos lost only this watchdog: another program switched it off.
+    rebooted: confirmed joints whose servos were reset, and so lost the watchdog armed before torque was switched on.
+    disarmed: confirmed joints whose servos lost only this watchdog, which another program switched off.
     tripped: joints whose Bus Watchdog may have tripped, which zeroes their goals; it has been cleared since.
     driven: joints in neither group, whose servos' torque is on because another program switches it on whenever it is
     cut.
@@ -166,10 +166,10 @@ def cut_torque(
     watchdog: float,
     interrupts: list[BaseException],
 ) -> tuple[tuple[Joint, ...], tuple[tuple[Joint, str], ...]]:
-    """Cut torque on all servos and read it back. Returns the confirmed ones, and the others with the reason.
+    """Cut torque on all servos and read it back. Returns the confirmed joints, and the others, each with the reason.
 
     silent: servos that did not answer the last exchange.
-    watchdog: the servos' Bus Watchdog [s].
+    watchdog: timeout of the servos' Bus Watchdogs [s].
     interrupts: receives every interrupt that arrives in the meantime.
     """
     left = dict(servos)
@@ -228,7 +228,7 @@ def tell_watchdogs(port: Port, servos: Mapping[Joint, Servo], seconds: float) ->
 
 
 def _tell(port: Port, servos: Mapping[Joint, Servo], register: str, value: int, times: int = 1) -> None:
-    """Write a one-byte register of all servos, without waiting for an answer. Raises PortLost."""
+    """Write to a one-byte register of all servos, without waiting for an answer. Raises PortLost."""
     every = list(servos.values())
     if not every:
         return
@@ -280,7 +280,7 @@ def is_torque_on(servo: Servo) -> bool | None:
 def has_torque(servo: Servo) -> bool | None:
     """Read whether a servo's torque is on; None if its answers may belong to other requests.
 
-    A reply does not say which register it comes from, so Torque Enable is read twice, with another register in between.
+    A reply does not identify its register, so Torque Enable is read twice, with another register in between.
     Raises the same errors as `Servo.read`.
     """
     first = servo.read_despite_error("Torque Enable")
@@ -289,7 +289,7 @@ def has_torque(servo: Servo) -> bool | None:
 
 
 def was_rebooted(servo: Servo) -> bool | None:
-    """Whether a servo whose watchdog is no longer armed was rebooted; None if it is armed, or nothing is known.
+    """Whether a servo whose watchdog is no longer armed was rebooted; None if it is armed, or if nothing is known.
 
     A reboot also resets the goal to its limit; a program that only writes to the watchdog leaves the goal as it is. A
     late reply to an earlier request could be mistaken for the answer, so another register is read before and after.

@@ -31,7 +31,7 @@ class TorqueSwitch:
     """Servos on one port, whose torque is switched on and off together.
 
     servos: keyed by single-servo joints, in bus order. After any error the same object can still cut torque;
-    `torque_off_report` then says whether that succeeded.
+    `torque_off_report` then shows whether that succeeded.
     """
 
     def __init__(self, port: Port, servos: Mapping[Joint, Servo]) -> None:
@@ -85,7 +85,7 @@ class TorqueSwitch:
 
     @property
     def armed_ticks(self) -> int:
-        """Value to which the Bus Watchdogs are armed [20 ms]."""
+        """Value written to arm the Bus Watchdogs [20 ms]."""
         return round(self._watchdog / WATCHDOG_UNIT)
 
     @contextmanager
@@ -94,7 +94,7 @@ class TorqueSwitch:
 
         watchdog: time without packets after which a servo stops by itself [s] (in steps of 20 ms, at most 2.54 s).
         Raises BusShared if another program has switched torque on; TorqueNotOff on exit if torque off could not be
-        confirmed; `torque_off_report` lists the servos.
+        confirmed (see `torque_off_report`).
         """
         self.refuse_switched_on()
         self.torque_off_report = None
@@ -177,7 +177,7 @@ class TorqueSwitch:
             tell_torque_off(self.port, self._servos)
 
     def torque_now(self) -> dict[Joint, bool | None]:
-        """Read whether each servo's torque is on, except those reported as unconfirmed; None if unknown."""
+        """Read, for each servo not reported as unconfirmed, whether its torque is on; None if unknown."""
         report = self.torque_off_report
         unconfirmed = set() if report is None else {joint for joint, _ in report.unconfirmed}
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}

@@ -3,11 +3,11 @@
 Bytes take wire time (ten bits each). A packet takes effect when its last byte arrives: the plant is advanced to that
 moment with the previous motor currents, then the addressed servos act. Replies start after the servo's return delay and
 reach the host `adapter_latency_us` later. When the host writes, everything up to the last packet of that write is
-computed, even if it lies ahead of the clock. The plant's advance is split where Bus Watchdogs, the servos' own loops
-and faults act between two packets.
+computed, even if it lies ahead of the clock. The plant's advance is split at each time between two packets at which a
+Bus Watchdog, the servos' own loops or a fault acts.
 
-When host and servo, or two servos with different IDs, transmit at once, the later packet and the rest of the earlier
-one are lost. Which servos act and reply is decided in `hil.fakes.bus.instructions`.
+When host and servo, or two servos with different IDs, transmit at the same time, the later packet and the rest of the
+earlier one are lost. Which servos act and reply is decided in `hil.fakes.bus.instructions`.
 """
 
 import math
@@ -135,7 +135,7 @@ class FakeBus:
     # The host's side
 
     def write(self, data: bytes) -> None:
-        """Put bytes on the wire, after those still being sent. They are lost if the cable is unplugged."""
+        """Put bytes on the wire, after those still being sent. The new bytes are lost if the cable is unplugged."""
         wire, receiver = self._wire, self._receiver
         now = self.clock.now()
         if now - self._origin >= self.faults.next_change:
@@ -315,7 +315,7 @@ class FakeBus:
             self._instructions.receive(packet, now)
 
     def _receive_with_faults(self, packet: Packet, now: float) -> None:
-        """Receive a packet, subject to faults; a servo with such a fault misses even packets to all servos."""
+        """Receive a packet, subject to faults; a servo affected by a fault also misses packets to all servos."""
         deaf: set[int] = set()
         for fault in self.faults.on_instructions:
             if not self.faults.strikes(fault, packet.id if fault.servo is None else fault.servo, now - self._origin):

@@ -6,7 +6,7 @@ Faults can also be given in TOML, as `[[fake.faults]]` with the same keys, and o
 lost_reply:servo=2,at=3`. `FAULTS` describes each kind. Times are seconds since the bus was created (`bus.time`).
 
 Packet faults (replies, instructions, noise) affect each packet with the given probability while they last. Any other
-fault occurs at most once, at its time, with the given probability. The same seed yields the same faults.
+fault occurs at most once, at the given time, with the given probability. The same seed yields the same faults.
 """
 
 import difflib

@@ -5,7 +5,7 @@
     bus.hand.release(2)
 
 Moves can also be given in TOML, as `[[fake.moves]]` with the same keys, on the command line, as `--move 2:to=0.5,at=4`,
-and while a fake terminal is being served, with `hil hand /tmp/arm 2:to=0.5`.
+and, while a fake terminal is being served, with `hil hand /tmp/arm 2:to=0.5`.
 
 The hand overcomes friction and gravity but never opposes motor torque: it does not grip a joint whose torque is on, and
 releases a joint as soon as one of its servos switches torque on.
@@ -121,7 +121,7 @@ class Hand:
         self._tell()
 
     def tick(self, now: float) -> None:
-        """Start moves that are due, and move the joints in hand; called once per period of the servos' loops.
+        """Start moves that are due, and move the joints that are held; called once per period of the servos' loops.
 
         now: time since the bus was created [s].
         """

@@ -6,7 +6,7 @@ from struct import Struct
 from hil.drivers.packet import BROADCAST_ID, HEADER, MAX_ID, MAX_LENGTH, Framer, Instruction, Packet, crc, unstuff
 
 MOST_ASKED = 1000
-"""Number of different group reads that are cached."""
+"""Maximum number of different group reads that are cached."""
 
 _STUFFED = b"\xff\xff\xfd\xfd"
 _FRONT = Struct("<4sBHB")  # header, ID, LEN, INST
@@ -43,7 +43,7 @@ class Receiver:
 
     @property
     def pending(self) -> int:
-        """Number of received bytes neither returned in a packet nor dropped as noise yet."""
+        """Number of received bytes not yet returned in a packet or dropped as noise."""
         return self._framer.pending
 
     @property

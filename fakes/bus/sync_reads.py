@@ -17,7 +17,7 @@ Reply = tuple[int, float, bytes]
 """One servo's reply: its ID, its delay [s], and the bytes."""
 
 MOST_PREPARED = 1000
-"""Number of different requests that are cached."""
+"""Maximum number of different requests that are cached."""
 
 _PLACE_LENGTH = 4  # address and length of a group read, before the IDs
 _FRONT_LENGTH = 8  # header, ID, LEN, INST of a status

@@ -1,4 +1,4 @@
-"""The bytes that a serial receiver reads from data sent at a different baud rate, or by several senders at once."""
+"""The bytes that a serial receiver reads if data are sent at a different baud rate, or by several senders at once."""
 
 from collections.abc import Iterable
 

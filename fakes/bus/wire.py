@@ -54,7 +54,7 @@ class Wire:
         """Time at which the last servo will have finished transmitting [s]."""
         self._latency_s = latency_s
         self._held = float("-inf"), float("-inf")
-        """End of the latest delayed transmission on the wire and at the host [s]."""
+        """Times at which the latest delayed transmission ends on the wire and at the host [s]."""
         self._arriving: deque[Arriving] = deque()
 
     def _set_baud(self, baud: int) -> None:
@@ -110,8 +110,8 @@ class Wire:
         self.reply_by = max(self.reply_by, until)
 
     def take(self, size: int, deadline: float, now: float) -> tuple[bytes, float]:
-        """Return up to `size` bytes that have arrived by `deadline`, and the arrival time of the last one [s], at least
-        `now`.
+        """Return up to `size` bytes that have arrived by `deadline`, and the arrival time of the last one, or
+        `now` if that is later [s].
         """
         arriving = self._arriving
         if arriving and len(arriving[0].data) == size:  # the usual case: the reply to one write, in one read

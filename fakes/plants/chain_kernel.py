@@ -58,7 +58,7 @@ def _frames(rotation: Any, shift: Any, axis: Any, q: Any, turn: Any, at: Any, z:
 
 
 def _equations(chain: Any, q: Any, v: Any, work: Any) -> None:  # noqa: PLR0912
-    """Compute mass matrix and bias at this state, into `work`."""
+    """Compute the mass matrix and bias forces in this state, into `work`."""
     rotation, shift, axis, gravity, mass, centre, inertia = chain
     turn, at, z, jv, spin, M, bias = work
     n = q.size

@@ -1,5 +1,5 @@
-"""The drive of one joint during a time step: current lag, torque, friction, stops. It runs in every step, so it uses
-plain floats.
+"""The drive of one joint during a time step: current lag, torque, friction, stops. This code runs in every step, so it
+uses plain floats.
 
 Presliding friction follows Canudas de Wit, Olsson, Astrom and Lischinsky (IEEE Transactions on Automatic Control 40
 (1995) 419): bristles deflect with the joint and slip,
@@ -92,7 +92,7 @@ class Motor:
         """Torque constant [N m/A], offset and Coulomb level [N m], Stribeck rise [1], 1 / Stribeck velocity [s/rad]."""
         self.viscous = drive.viscous * viscous
         self.plain = (*self.constants, self.viscous, self._lag)
-        """`constants`, viscous friction [N m s/rad] and current lag [s]: all that is used while the drive is plain."""
+        """`constants`, viscous friction [N m s/rad] and current lag [s]: all parameters that a plain drive needs."""
 
     @property
     def is_plain(self) -> bool:

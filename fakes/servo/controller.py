@@ -2,7 +2,7 @@
 
 Source: the block diagrams and gain units of the ROBOTIS e-Manual (pages x/<model>, Velocity PI Gain, Position PID
 Gain). The units are 1/128 for P gains, 1/65536 for I gains, 1/16 for the D gain, 1/4 and 1 for the feedforward gains.
-The period of the control loop (1 ms here), the signal that the D gain multiplies and the filters are uncertain.
+Uncertain are the period of the control loop (1 ms here), the signal that the D gain multiplies, and the filters.
 """
 
 import math

@@ -96,7 +96,7 @@ class Present:
         self.forget_turns(position)
 
     def clear(self, body: bytes, moving: bool, position: float) -> int:
-        """Execute the instruction Clear (reset the turns); return the error number.
+        """Execute the instruction Clear (reset the turn count); return the error number.
 
         Errors other than Result Fail are uncertain.
         """

@@ -25,7 +25,7 @@ from hil.fakes.servo.model_facts import (
 )
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
-"""Baud rates by the value of the register Baud Rate. The 330 models only go up to 4 MBd."""
+"""Baud rates, indexed by the value of the register Baud Rate. The 330 models only go up to 4 MBd."""
 
 TICKS_PER_TURN = 4096
 VELOCITY_UNIT_RPM = 0.229

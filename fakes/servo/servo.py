@@ -130,7 +130,7 @@ class EmulatedServo(Powered):
         """Power up at time `now` [s]; the servo does not respond for `boot_s` [s].
 
         angle: returns the joint's current position [rad]; it is also called later.
-        RAM registers take their initial values, or those of the backup if Startup Configuration says so; the XL320's
+        RAM registers take their initial values, or those of the backup if Startup Configuration selects it; the XL320's
         Torque Limit is set to Max Torque. Torque is off, and errors are cleared. The turn count is lost: Present
         Position starts within one turn (before Homing Offset).
         """
@@ -303,7 +303,7 @@ class EmulatedServo(Powered):
         return StatusError.NONE
 
     def write_as_shadow(self, address: int, data: bytes) -> int:
-        """Write a range of the control table, addressed by Secondary ID; return the error number."""
+        """Write a range of the control table, as requested through the Secondary ID; return the error number."""
         return self._write_stretch(address, data, shadow=True)
 
     def _write_stretch(self, address: int, data: bytes, *, shadow: bool) -> int:
@@ -347,7 +347,7 @@ class EmulatedServo(Powered):
         return self.write(body[0] | body[1] << 8, body[2:])
 
     def _clear_turns(self, body: bytes, moving: bool) -> int:
-        """Execute the instruction Clear; remove the same turns from Goal Position, trajectory and Present Position."""
+        """Execute the instruction Clear: shift Present Position, Goal Position and trajectory by the same turns."""
         before = self.present.ticks(self._angle())
         if error := self.present.clear(body, moving, self._angle()):
             return error
@@ -395,7 +395,7 @@ class EmulatedServo(Powered):
         self.id = memory.get("ID")
         shadow = memory.get("Secondary(Shadow) ID", _NO_SHADOW_ID)
         self.shadow_id = shadow if shadow < _NO_SHADOW_ID else None
-        """Secondary ID, for which it executes instructions without replying; None if it has none."""
+        """Secondary ID: instructions to it are executed without a reply; None if the servo has none."""
         baud = memory.get("Baud Rate", BAUD_RATES.index(self._set_baud))
         self.baud = BAUD_RATES[baud] if baud < len(BAUD_RATES) else self._set_baud
         self.return_delay_s = 2e-6 * memory.get("Return Delay Time")

@@ -95,7 +95,7 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
 
 
 def seldom_as_measured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> str:
-    """As `seldom_read_back`, for the configured exchange mode as it was measured. Raises DriverError."""
+    """Return `seldom_read_back` for the configured exchange mode with its measured timing. Raises DriverError."""
     used = _configured(bus, modes)
     exchange = bus.make_exchange(fast=used.fast, one_write=used.one_write)
     bus.add_read_back(exchange)
@@ -103,10 +103,10 @@ def seldom_as_measured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> str:
 
 
 def seldom_read_back(bus: ServoBus, exchange: Exchange, off_wire: float) -> str:
-    """Return a sentence on goals and torque that are read back only now and then, since cycles leave no time; "" if
-    they are read back regularly.
+    """Return a warning that cycles leave too little time to read back goals and torque regularly; "" if there is
+    enough time.
 
-    off_wire: what an exchange takes in addition to its time on the wire [s].
+    off_wire: duration of an exchange in addition to its wire time [s].
     """
     every, shortest = exchange.read_back_every(off_wire)
     if not every:

@@ -15,10 +15,10 @@ __all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "may_be_later
 
 _MODE, _DELAY = "Operating Mode", "Return Delay Time"
 _GOAL_PWM = "Goal PWM"
-"""Limits the voltage in current mode. A tripped watchdog sets it to 0, which is then no evidence."""
+"""Register that limits the voltage in current mode. After the watchdog has tripped, its value of 0 proves nothing."""
 
 _BESIDE = frozenset({*PROTECTIVE, STATUS_LEVEL}) - {SECONDARY_ID}
-"""Settings that are always named, although they explain no stop, except for a Status Return Level of 0."""
+"""Settings that cannot explain a stop (except a Status Return Level of 0) but are named along with others that can."""
 
 _REGISTERS = (
     _MODE,
@@ -59,7 +59,7 @@ _MOVED = frozenset(
 EXPLAINED = _MOVED | _LATE
 
 _AT_A_LIMIT = frozenset({Cause.POSITION, Cause.VELOCITY})
-"""Causes of a stop that too much torque alone can explain."""
+"""Causes of a stop that excessive torque by itself can explain."""
 
 _MODES_SEEN_S = 0.06
 """If the operating modes were read back less than this time [s] before a stop, a changed mode may have been changed
@@ -73,8 +73,8 @@ def settings_now(bus: ServoBus) -> Settings:
     """Read the settings that determine how servos move, what they report and when they protect themselves.
 
     Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
-    to an earlier request. If the two readings differ, the value is unknown and omitted. So are all values of a servo
-    whose ID is read wrongly: its replies are late, and equal values may be those of other registers.
+    to an earlier request. If the two readings differ, the value is unknown and omitted, as are all values of a
+    servo whose ID is read wrongly: its replies are late, and equal values may be those of other registers.
     """
     found: dict[tuple[Joint, str], int] = {}
     report = bus.torque_off_report
@@ -94,7 +94,7 @@ def settings_now(bus: ServoBus) -> Settings:
 
 
 def changed_settings(before: Settings, after: Settings, cause: Cause | None = None) -> str:
-    """Return a message that names the settings that differ; "" if none do.
+    """Return a message that names the settings that differ; "" if there are none, or if none can explain the stop.
 
     cause: the cause of a stop. Settings that cannot explain it are omitted, except for those in `_BESIDE`.
     """
@@ -144,7 +144,7 @@ def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago
 
 
 def _may_explain(register: str, cause: Cause | None, now: int) -> bool:
-    """now: the register's present value."""
+    """Whether a change to `now`, the register's present value, may explain a stop."""
     if register == STATUS_LEVEL and now == 0:
         return cause in (None, Cause.MISSING)
     if cause is None or register in _BESIDE:

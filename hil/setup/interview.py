@@ -78,8 +78,8 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
 
 
 def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: Ask, say: Say) -> list[int]:
-    """Return the Present Positions in the rest pose. Hanging joints are read from both sides, since friction holds
-    them.
+    """Return the Present Positions in the rest pose. Hanging joints are read after a push from either side, since
+    friction holds them.
     """
     ask(_POSE[stance], "")
     first = [servo.read("Present Position") for servo in handles]
@@ -147,7 +147,7 @@ def _name(number: int, found: Found, ask: Ask) -> str:
 
 
 def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
-    """Determine which way Present Position counts; +1 if it increases counter-clockwise.
+    """Determine in which direction Present Position increases; return +1 if counter-clockwise, otherwise -1.
 
     The arm is viewed so that it hangs down, and points to the right when lifted.
     """

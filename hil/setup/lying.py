@@ -104,7 +104,7 @@ def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
 
 
 def said_of_the_rest(config: Config, lies: Config) -> str:
-    """Return a message that the arm does not lie in its rest pose, with its actual angles."""
+    """Return a message that states that the arm does not lie in its rest pose and gives its actual angles."""
     each = zip(config.joints, lies.arm.rest_pose, config.arm.rest_pose, strict=True)
     away = [
         f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})"

@@ -1,4 +1,4 @@
-"""Check for anything that would stop an experiment, and say how to fix it. Torque stays off."""
+"""Check for anything that would stop an experiment, and state how to fix it. Torque stays off."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -87,7 +87,7 @@ def check_arm(config: Config) -> Iterator[Finding]:
 
 
 def _torque_of_pilot(config: Config) -> Iterator[Finding]:
-    """Report a torque setting that the pilot ignores, or one that is missing without a pilot."""
+    """Report a torque setting that the pilot ignores, or that is missing although there is no pilot."""
     if config.experiment.pilot and config.experiment.peak_torque is not None:
         fix = (
             "`hil identify` ignores peak_torque: the pilot finds the torque, up to current_limit or voltage_limit. "
@@ -212,7 +212,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
 
 
 def _still_off(bus: ServoBus) -> Iterator[Finding]:
-    """Report torque that has come on since the servos were checked: this check switches it neither on nor off."""
+    """Report torque that was switched on after the servos were checked: this check switches it neither on nor off."""
     try:
         on = switched_on(bus.drives)
     except DriverError as error:

@@ -54,7 +54,7 @@ def set_up(
     return_delay_us: int | None = None,
     secondary_id: int | None = None,
 ) -> list[Change]:
-    """Make the requested changes that differ from the current values, each after `confirm` has agreed.
+    """Change the settings whose requested and current values differ, each after `confirm` has agreed.
 
     The port is left at the baud rate at which the servo was last heard. A status packet lost while ID or baud rate
     changes is not a failure: the servo is searched for at both the old and the new value.

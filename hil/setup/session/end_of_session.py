@@ -1,4 +1,4 @@
-"""End of a session: which exception is finally raised, and what it says about torque."""
+"""End of a session: which exception is finally raised, and what it states about torque."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,7 @@ _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the ru
 """Message if every servo has eventually answered and nothing else is wrong."""
 
 _TELLS_OF_TORQUE = re.compile("torque (off )?is", re.IGNORECASE)
-"""Matches every sentence that says whether torque is off (see `TorqueOff`)."""
+"""Matches every sentence that states whether torque is off (see `TorqueOff`)."""
 
 _NEVER_ON = "Torque is off on all servos, confirmed by reading it back; this command has not switched it on."
 

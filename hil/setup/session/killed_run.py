@@ -38,7 +38,7 @@ class Left:
     is_to_restore: bool
 
     def told(self, title: str) -> str:
-        """Return a message that says what is restored and what is not; it begins with `title`, the name of the
+        """Return a message that states what is restored and what is not; it begins with `title`, the name of the
         servo.
         """
         others = self.others if self.changed else ""

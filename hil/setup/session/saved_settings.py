@@ -60,7 +60,7 @@ class SavedSettings:
             self._keep(joint, settings, changed)
 
     def _take_over(self, joint: Joint, left: Left, changed: dict[str, int]) -> None:
-        """Save the settings that an earlier run left, and say which of them will be restored.
+        """Save the settings that an earlier run left, and report which of them will be restored.
 
         A value that another program has set counts as the servo's own from now on, unless it prevents this run.
         """

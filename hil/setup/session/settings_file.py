@@ -1,8 +1,8 @@
 """The servos' settings before a program changed them, in files that outlive the program.
 
 There is one file per servo in the user's state folder, named after port, ID and model: however a program ends, the next
-program on that port finds the file and restores the settings. An adapter with a serial number is named instead of the
-port, whose name may later be that of another arm.
+program on that port finds the file and restores the settings. If the adapter has a serial number, the file is named
+after the adapter instead of the port, whose name may later belong to another arm.
 """
 
 import json

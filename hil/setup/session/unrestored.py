@@ -77,7 +77,7 @@ def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
 
 
 def _changed_delays(saved: SavedSettings, delays: Mapping[Joint, int], silent: Collection[Joint]) -> Iterator[str]:
-    """Say which Return Delay Times were changed during the session, by another program or a factory reset."""
+    """Report which Return Delay Times were changed during the session, by another program or a factory reset."""
     for joint, before in delays.items():
         now = before
         if joint not in silent:
@@ -92,7 +92,7 @@ def _changed_delays(saved: SavedSettings, delays: Mapping[Joint, int], silent: C
 
 
 def _lowered_limits(saved: SavedSettings, settings: Settings, silent: Collection[Joint]) -> Iterator[str]:
-    """Say which PWM Limits were lowered during the session, and which goals they keep from being restored."""
+    """Report which PWM Limits were lowered during the session, and which goals cannot be restored as a result."""
     for joint, servo in saved.bus.drives.items():
         before = settings.get((joint, _PWM_LIMIT))
         if before is None or joint in silent:
