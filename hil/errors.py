@@ -18,7 +18,7 @@ HilError                    exit code
 
 hil.drivers.errors.DriverError  1   communication with the servos; subclasses are listed there.
                                 UnknownModel, PortNotOpened, WrongModel and WrongSetting exit with 2
-hil.estimator.errors.EstimationError  1   the recording does not determine the parameters; subclasses there
+hil.estimator.errors.EstimationError  1   the recording does not determine the parameters; subclasses are listed there
 """
 
 import signal
@@ -45,7 +45,7 @@ __all__ = [
 
 
 class Cause(Enum):
-    """What the guard detected. If measurement and drive still work, the stop may begin with braking."""
+    """What the guard detected. If measurement and drive still work, the stop can begin with braking."""
 
     POSITION = "position limit"
     VELOCITY = "velocity limit"
@@ -80,7 +80,7 @@ class Cause(Enum):
 
     @property
     def allows_lowering(self) -> bool:
-        """Whether the servos still accept commands, so that an arm may be lowered under supervision.
+        """Whether the servos still accept commands, so that an arm can be lowered under supervision.
 
         A servo that has lost its watchdog still obeys; if the watchdog had tripped, the loss of torque would be
         detected during lowering. A servo that has set its alert bit may still have torque; its torque state is read
@@ -136,7 +136,7 @@ class ResultError(HilError):
 
 
 class ExportError(HilError):
-    """A model cannot be written in a format. Example: no link of positive mass could have these parameters."""
+    """A model cannot be written in this format. Example: no link of positive mass could have these parameters."""
 
     exit_code = 2
 

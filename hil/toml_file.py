@@ -1,4 +1,4 @@
-"""Reading TOML files: one reader for configurations, fake arms and results, so that all accept the same files.
+"""The only reader of TOML files, so that configurations, fake arms and results follow the same rules.
 
 Text is UTF-8, with or without the byte order mark that some Windows programs write.
 """
@@ -13,7 +13,7 @@ from hil.description.regular_file import not_a_file
 
 
 class TomlFileError(ValueError):
-    """A file that cannot be read or is not TOML; the text is the whole message and names the file."""
+    """Raised if a file cannot be read or is not TOML; the text is the complete message and names the file."""
 
 
 def load_toml(path: Path) -> dict[str, Any]:
@@ -55,7 +55,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 
 def _encoding_of(path: Path, error: UnicodeDecodeError) -> str:
-    """Say what a file that is not UTF-8 text is, and how to save it as UTF-8."""
+    """Describe the contents of a file that is not UTF-8 text, and say how to save it as UTF-8."""
     data = path.read_bytes()
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and (b"=\0" in data or b"\0=" in data):
         return "UTF-16 text, as some Windows programs write it: save it as UTF-8"
@@ -67,7 +67,7 @@ def _encoding_of(path: Path, error: UnicodeDecodeError) -> str:
 
 
 def _not_toml(path: Path, error: Exception, text: str) -> str:
-    """The error message for a file with this text, which the TOML parser rejects: the line, and the likely cause."""
+    """The error message for text that the TOML parser rejects: the line, and the likely cause."""
     other = {".yaml": "YAML", ".yml": "YAML", ".json": "JSON", ".xml": "XML", ".urdf": "XML", ".csv": "CSV"}
     kind = other.get(path.suffix.lower())
     if kind is not None:
