@@ -62,7 +62,7 @@ class ArmModel:
         return f"<{type(self).__name__} of {len(self.joints)} joints ({names}), {len(self.values)} parameters>"
 
     def inverse_dynamics(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
-        """Motor torques (..., joints) [N m] for a motion, with friction, offset, cable, cogging and ripple.
+        """Motor torques (..., joints) [N m] for a motion: inertia, Coriolis, gravity, friction, offset, cable, cogging.
 
         Args:
             q: angles (..., joints) [rad].
@@ -81,7 +81,7 @@ class ArmModel:
         return torque.reshape(q.shape)
 
     def rigid_body_torque(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
-        """Torques of the rigid links alone: `inverse_dynamics` without friction, offset, cable, cogging and ripple."""
+        """Torques of the rigid links alone: `inverse_dynamics` without friction, offset, cable, cogging or ripple."""
         q, dq, ddq = self._motion(q=q, dq=dq, ddq=ddq)
         return np.asarray(np.moveaxis(self._rigid_body(*(_joints_first(x) for x in (q, dq, ddq))), 0, -1))
 

@@ -23,7 +23,7 @@ def _quoted(word: str) -> str:
     """Quote a word, as $'...' (bash) if it contains unprintable characters."""
     if word.isprintable():
         return shlex.quote(word)
-    # Python writes bytes alike, and in single quotes if a double one is among them.
+    # Python writes bytes in the same way, and in single quotes if they contain a double quote.
     return "$" + repr(os.fsencode(word) + b'"')[1:-2] + "'"
 
 

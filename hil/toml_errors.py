@@ -122,7 +122,7 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
 
 
 def what_is_wrong(detail: Any) -> str:
-    """Say what the value rejected by one of pydantic's errors must be."""
+    """Say what a value must be, given one of pydantic's errors."""
     kind, value = detail["type"], detail["input"]
     if kind in _BOUNDS and str(value).lower() in ("nan", "inf", "-inf"):
         kind = "finite_number"
@@ -207,8 +207,8 @@ def _meant(value: object, expected: str) -> str:
 
 
 def meant_name(given: str, names: Sequence[str]) -> str:
-    """Return the intended name: the same except for case, spaces and dashes, or the most similar one; "" if none is
-    similar. Short names never count as similar: grad is not rad.
+    """Return the name that was meant: one that differs only in case, spaces and dashes, or the most similar one; "" if
+    none is similar. Short names never count as similar: grad is not rad.
     """
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
     bare = re.sub(r"[^a-z0-9]", "", given.lower())

@@ -85,7 +85,7 @@ def _not_toml(path: Path, error: Exception, text: str) -> str:
 
 
 def _given_twice(error: str, text: str, number: int) -> str:
-    """Name the key or table that the statement ending on line `number` gives for a second time; "" for other errors."""
+    """Name the key or table that the statement ending on line `number` repeats; "" for other errors."""
     if not error.startswith(("Cannot overwrite", "Cannot declare")):
         return ""
     lines, begins = text.split("\n"), _beginnings(text)
@@ -112,7 +112,7 @@ def _given_twice(error: str, text: str, number: int) -> str:
 
 
 def _other_brackets(header: re.Match[str], lines: list[str], begins: list[int]) -> str:
-    """Say that the table of a header is given once as [name] and once as [[name]]; "" if it is not."""
+    """Say that the table of this header is given both as [name] and as [[name]]; "" if it is not."""
     at: dict[str, int] = {}
     for count in begins:
         other = _HEADER.match(lines[count - 1])
@@ -135,7 +135,7 @@ def _repeated(what: str, table: str, number: int, first: int | None) -> str:
 
 
 def _is_within(given: tuple[str, str], name: str) -> bool:
-    """Whether a table and key belong to the tables `name`; a header counts as a key of the table ""."""
+    """Whether a table and key belong to a table called `name`; a header counts as a key of the table ""."""
     table, key = given
     return re.match(rf"(?:the )?\[\[?{re.escape(name)}[\].]", table or key) is not None
 

@@ -74,7 +74,7 @@ ALLOW_CODE = "--allow-code"
 
 @contextmanager
 def _code_as_asked() -> Iterator[None]:
-    """Accept --allow-code anywhere on the command line: any subcommand may open a file whose [fake] table names a
+    """Accept --allow-code anywhere on the command line: any subcommand can open a file whose [fake] table names a
     function.
     """
     words = sys.argv[1:]

@@ -37,8 +37,8 @@ def moves(arm: ArmDescription, angles: Array, joint: int, up: Array | tuple[floa
 
 
 def _towards(vector: Array, up: Array) -> str:
-    """Name the base's axis that is nearest to a vector, and the direction of this axis for an observer next to the
-    arm.
+    """Name the base's axis that is nearest to a vector, and the direction of this axis as seen by an observer next
+    to the arm.
 
     The observer looks along the base's x axis or, if that is vertical, along its z axis.
     """

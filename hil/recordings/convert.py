@@ -52,7 +52,7 @@ def convert(table: Table, columns: Columns) -> Converted:
     """
     whole = guessed(table, columns)
     notes = [] if whole == columns else [said(whole, table)]
-    assert whole.position is not None and whole.drive is not None  # or guessed would have raised
+    assert whole.position is not None and whole.drive is not None  # or `guessed` would have raised CsvError
     notes += _unused(table, whole)
     time = _time(table, whole)
     ticks = 0.0 if whole.ticks_per_turn is None else 2.0 * np.pi / whole.ticks_per_turn

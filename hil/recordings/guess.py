@@ -74,7 +74,7 @@ def said(columns: Columns, table: Table) -> str:
 
 
 def _described(kind: str, names: Sequence[str], columns: Columns, table: Table) -> str:
-    """The columns' names, with their unit if the header does not state it."""
+    """The columns' names, with their units if the header does not state them."""
     given = getattr(columns, f"{kind}_unit", None)
     if given is not None:
         return f"{', '.join(names)} [{given}]"

@@ -301,7 +301,7 @@ class PhysicalQuantity(Quantity):
 
 @dataclass(frozen=True)
 class Physical:
-    """Masses, centres of mass and inertias, using [known]. not_told_apart: groups of quantities that cannot be
+    """Masses, centres of mass and inertias, derived with [known]. not_told_apart: groups of quantities that cannot be
     separated unless another quantity is known.
     """
 

@@ -25,7 +25,7 @@ def check_archive(path: Path) -> None:
     BadZipFile.
     """
     with path.open("rb") as file:
-        # What precedes the archive ZipFile skips, but numpy takes the file for a pickle, and advises to load it.
+        # ZipFile skips data before the archive; numpy would take the file for a pickle and advise loading it.
         if file.read(2) != b"PK":
             raise BadZipFile("it does not begin like an .npz file")
     with ZipFile(path) as archive:

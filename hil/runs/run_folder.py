@@ -268,8 +268,8 @@ class RunFolder:
             write_json(self.rest_pose_path, {"rest_pose": list(played.arm.rest_pose)})
 
     def set_aside(self, name: str, played: Config) -> None:
-        """Move the recording of a run to the subfolder `name`, so that another run can use this folder. played: its
-        configuration.
+        """Move the recording of a run to the subfolder `name`, so that another run can use this folder. played: the
+        moved run's configuration.
         """
         folder = self.below(name, played)
         try:

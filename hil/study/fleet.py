@@ -52,7 +52,7 @@ class FleetArm:
 
 @dataclass(frozen=True)
 class Fleet:
-    """Comparison of the arms of one type. spreads, unlike (outliers, largest first): empty if there are too few."""
+    """Comparison of the arms of one type. spreads, unlike (outliers, largest first): empty for too few arms."""
 
     type: str
     arms: tuple[FleetArm, ...]
