@@ -1,4 +1,4 @@
-"""Run the `hil` command as `python -m hil`."""
+"""Make `python -m hil` run the `hil` command."""
 
 from hil.cli.app import main
 

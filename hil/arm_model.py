@@ -1,6 +1,6 @@
 """An identified arm as a model: inverse and forward dynamics, gravity and friction. Needs numpy only.
 
-Equations and names are as in docs/model.md. The last axis of every array runs over the joints; any axes may come before
+Equations and names are as in docs/model.md. The last axis of every array runs over the joints; any axes may precede
 it.
 """
 
@@ -46,8 +46,8 @@ class JointFacts:
 class ArmModel:
     """The dynamics of an identified arm of one or two joints.
 
-    values, stds: base parameters, friction terms and drive terms, by name [SI]. gravity: gravitational acceleration in
-    the plane of the arm [m/s^2].
+    values, stds: base parameters, friction terms and drive terms, and their standard errors, by name [SI]. gravity:
+    gravitational acceleration in the plane of the arm [m/s^2].
     """
 
     values: Mapping[str, float]
@@ -81,7 +81,7 @@ class ArmModel:
         return torque.reshape(q.shape)
 
     def rigid_body_torque(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
-        """Torques of the rigid links alone: `inverse_dynamics` without friction and offset."""
+        """Torques of the rigid links alone: `inverse_dynamics` without friction, offset, cable, cogging or ripple."""
         q, dq, ddq = self._motion(q=q, dq=dq, ddq=ddq)
         return np.asarray(np.moveaxis(self._rigid_body(*(_joints_first(x) for x in (q, dq, ddq))), 0, -1))
 
@@ -155,7 +155,7 @@ class ArmModel:
         return list(taken.values())
 
     def _inverse(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """Motor torques (joints, ...) [N m]; arguments also have the joints first."""
+        """Motor torques (joints, ...) [N m]; in the arguments, too, the joints are the first axis."""
         torque = self._rigid_body(q, dq, ddq)
         for joint, v in enumerate(dq, start=1):
             step = self._step(joint, v)

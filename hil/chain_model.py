@@ -22,7 +22,7 @@ class Geometry:
 
     rotation, translation: pose of the joint's frame relative to the previous link's frame at angle zero, (joints, 3, 3)
     and (joints, 3) [m]. axis: joint axis in its own frame (joints, 3). gravity: gravity in the frame of the base as
-    configured, before any identified tilt (3,) [m/s^2].
+    configured, without any identified tilt (3,) [m/s^2].
     """
 
     rotation: Array
@@ -55,7 +55,7 @@ class ChainArmModel(ArmModel):
 
     @property
     def base_gravity(self) -> Array:
-        """Gravity in the frame of the base (3,) [m/s^2], with the identified tilt."""
+        """Gravity in the frame of the base (3,) [m/s^2], including the identified tilt."""
         return tilted(self.geometry.gravity, *(self.values.get(name, 0.0) for name in TILT))
 
     def _rigid_body(self, q: Array, dq: Array, ddq: Array) -> Array:
@@ -66,7 +66,7 @@ class ChainArmModel(ArmModel):
         return self._torque(q, nothing, nothing, self.base_gravity)
 
     def _torque(self, q: Array, dq: Array, ddq: Array, gravity: Array) -> Array:
-        """Joint torques (joints, ...) [N m] without friction; q, dq and ddq have the joints first."""
+        """Joint torques (joints, ...) [N m] without friction; the joints are the first axis of q, dq and ddq."""
         count, shape = len(q), q.shape[1:]
         turn, place = np.broadcast_to(np.eye(3), (*shape, 3, 3)), np.zeros((*shape, 3))
         spin, spun = np.zeros((*shape, 3)), np.zeros((*shape, 3))

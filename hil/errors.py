@@ -18,7 +18,7 @@ HilError                    exit code
 
 hil.drivers.errors.DriverError  1   communication with the servos; subclasses are listed there.
                                 UnknownModel, PortNotOpened, WrongModel and WrongSetting exit with 2
-hil.estimator.errors.EstimationError  1   the recording does not determine the parameters; subclasses there
+hil.estimator.errors.EstimationError  1   the recording does not determine the parameters; subclasses are listed there
 """
 
 import signal
@@ -45,7 +45,7 @@ __all__ = [
 
 
 class Cause(Enum):
-    """What the guard detected. If measurement and drive still work, the stop may begin with braking."""
+    """What the guard detected. If measurement and drive still work, the stop can begin with braking."""
 
     POSITION = "position limit"
     VELOCITY = "velocity limit"
@@ -80,10 +80,10 @@ class Cause(Enum):
 
     @property
     def allows_lowering(self) -> bool:
-        """Whether the servos still accept commands, so that an arm may be lowered under supervision.
+        """Whether the servos still accept commands, so that an arm can be lowered under supervision.
 
-        A servo that has lost its watchdog still obeys; if the watchdog had tripped, the loss of torque would be
-        detected during lowering. A servo that has set its alert bit may still have torque; its torque state is read
+        A servo that has lost its watchdog still obeys commands; if the watchdog had tripped, the loss of torque would
+        be detected during lowering. A servo that has set its alert bit may still have torque; its torque state is read
         first.
         """
         others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
@@ -114,7 +114,7 @@ class RunFolderError(HilError):
 
 
 class SchedulerLost(HilError):
-    """The scheduler of a study no longer responds. Example: its machine was switched off; continue with --resume."""
+    """The scheduler of a study no longer responds. Example: its machine was switched off. Use --resume to continue."""
 
 
 class CsvError(HilError):
@@ -136,7 +136,7 @@ class ResultError(HilError):
 
 
 class ExportError(HilError):
-    """A model cannot be written in a format. Example: no link of positive mass could have these parameters."""
+    """The requested format cannot hold the model. Example: no link of positive mass could have these parameters."""
 
     exit_code = 2
 

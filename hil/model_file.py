@@ -78,7 +78,7 @@ def read_result(path: Path) -> Result:
 
 
 def read_settled_result(path: Path) -> SettledResult:
-    """Read a result that was estimated from settled periods. Raises ResultError for any other result, too."""
+    """Read a result that was estimated from settled periods. Raises ResultError for any other result."""
     result = read_result(path)
     if not isinstance(result, SettledResult):
         raise ResultError(
@@ -99,7 +99,7 @@ def read_model(path: str | PathLike[str]) -> ArmModel:
 
 
 def read_usable_result(path: Path) -> Result:
-    """Read a result that contains all data that a model of the arm needs. Raises ResultError if it does not."""
+    """Read a result that contains all the data that a model of the arm needs. Raises ResultError for any other."""
     result = read_result(path)
     if result.arm is None:
         raise ResultError(

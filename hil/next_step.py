@@ -1,4 +1,4 @@
-"""The command to type next: from `hil scan` to `hil export`, each command names its successor in its last line."""
+"""The command to type next: from `hil scan` to `hil export`, each command ends by naming the next one."""
 
 import os
 import shlex
@@ -10,7 +10,7 @@ NEXT = "Next: "
 
 
 def next_step(*words: object) -> str:
-    """The line that names the next command, quoted for a shell."""
+    """The line that names the next command, which is quoted for a shell."""
     return f"{NEXT}{command(*words)}"
 
 
@@ -20,10 +20,10 @@ def command(*words: object) -> str:
 
 
 def _quoted(word: str) -> str:
-    """Quote a word, as $'...' (bash) if it has unprintable characters."""
+    """Quote a word, as $'...' (bash) if it contains unprintable characters."""
     if word.isprintable():
         return shlex.quote(word)
-    # Python writes bytes alike, and in single quotes if a double one is among them.
+    # Python writes bytes in the same way, and in single quotes if they contain a double quote.
     return "$" + repr(os.fsencode(word) + b'"')[1:-2] + "'"
 
 
@@ -35,7 +35,7 @@ def steps_of(path: Path) -> list[Path]:
 
 
 def only_steps(path: Path, steps: Sequence[Path]) -> str:
-    """Explain that an identification stopped before its full run, and how to look at what was recorded."""
+    """Explain that an identification stopped before its full run, and how to view what was recorded."""
     names = ", ".join(each.name for each in steps)
     return (
         f"{path}: its identification ended before the full run, so there is no result; recorded: {names}. Identify "

@@ -12,7 +12,7 @@ _INDENT = 2
 
 
 class ResultConsole(Console):
-    """Standard output, without rich's colours and its handling of a closed pipe (see `hil.cli.output`)."""
+    """Standard output, without rich's colours or its handling of a closed pipe (see `hil.cli.output`)."""
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError
@@ -28,7 +28,7 @@ def say(console: Console, text: str) -> None:
 
 
 def say_behind(console: Console, label: str, text: str, style: str = "") -> None:
-    """Print a sentence after a label; on a terminal, continuation lines are aligned with the first."""
+    """Print a sentence after a label; on a terminal, continuation lines are aligned with the start of the sentence."""
     line = Text(label, style=style) + Text(text)
     if not console.is_terminal or line.cell_len <= console.width or len(label) > console.width // 3:
         console.print(line, soft_wrap=not console.is_terminal)
@@ -67,7 +67,7 @@ def print_fitting(console: Console, table: Table) -> None:
 
 
 def _paragraphs(table: Table) -> Iterator[tuple[str, list[str]]]:
-    """The first cell of each row (or that of the row above, if it is empty), and the others with their headings."""
+    """For each row: the first cell (if empty, that of the row above), and the other cells with their headings."""
     headings = [str(column.header) for column in table.columns]
     title = ""
     for row in zip(*(column.cells for column in table.columns), strict=True):

@@ -8,10 +8,10 @@ __all__ = ["rest_pose_hint", "within_limits"]
 
 def within_limits(position: float, limits: Sequence[float]) -> float:
     """Return `position` if it is within the limits, otherwise the angle a whole number of turns away that is nearest to
-    their middle.
+    the middle of the limits.
 
-    A servo does not count turns while it is off, and `position` assumes the turn closest to the rest pose or to zero.
-    If no turn is within the limits, the result is the one that is least beyond them. All angles are in rad.
+    A servo does not count turns while it is off, so `position` is in the turn closest to the rest pose or to zero.
+    If no such angle is within the limits, the result is the one that exceeds them least. All angles are in rad.
     """
     low, high = limits
     if low <= position <= high:
@@ -25,8 +25,8 @@ def rest_pose_hint(position: float, rest: float, tolerance: float, zero_ticks: i
     Args:
         position: measured angle [rad].
         rest: the joint's angle in arm.rest_pose [rad].
-        tolerance: deviation that is allowed [rad].
-        zero_ticks: the value that would make the present position the rest pose.
+        tolerance: allowed deviation [rad].
+        zero_ticks: value of this key that would make the present position the rest pose.
     """
     mirrored = (
         "In a first run, check direction: with the opposite sign, the joint would be in its rest pose. "

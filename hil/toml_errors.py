@@ -1,4 +1,4 @@
-"""Error messages for TOML files, and for the same tables written in Python: key, value, and what is allowed."""
+"""Error messages for TOML files, and for the same tables written in Python: the key, the value, and what is allowed."""
 
 import difflib
 import re
@@ -122,7 +122,7 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
 
 
 def what_is_wrong(detail: Any) -> str:
-    """Say what a value must be, for one of pydantic's errors."""
+    """Say what a value must be, given one of pydantic's errors."""
     kind, value = detail["type"], detail["input"]
     if kind in _BOUNDS and str(value).lower() in ("nan", "inf", "-inf"):
         kind = "finite_number"
@@ -160,7 +160,7 @@ def _as_list(detail: Any, joints: int | None) -> str:
 
 
 def _unit_hint(detail: Any, root: type[BaseModel]) -> str:
-    """Name the unit in which a number beyond its bounds would make sense, and what to write."""
+    """Name the unit in which a number beyond its bounds would make sense, and say what to write."""
     value = detail["input"]
     if detail["type"] not in _BOUNDS or isinstance(value, bool) or not isinstance(value, int | float):
         return ""
@@ -207,8 +207,8 @@ def _meant(value: object, expected: str) -> str:
 
 
 def meant_name(given: str, names: Sequence[str]) -> str:
-    """Return the intended name: the same except for case, spaces and dashes, or the most similar one; "" if none is
-    similar. Short names never count as similar: grad is not rad.
+    """Return the name that was meant: one that differs only in case, spaces and dashes, or the most similar one; "" if
+    none is similar. Short names never count as similar: grad is not rad.
     """
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
     bare = re.sub(r"[^a-z0-9]", "", given.lower())
@@ -218,7 +218,7 @@ def meant_name(given: str, names: Sequence[str]) -> str:
 
 
 def _in_thousands(expected: str, value: object) -> str:
-    """Name the listed number that is meant if it was given in thousands or millions, such as a rate in Mbaud."""
+    """Name the allowed number that was meant if the value is in thousands or millions, such as a rate in Mbaud."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return ""
     for name, factor in (("thousands", 1e3), ("millions", 1e6)):

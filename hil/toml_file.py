@@ -1,4 +1,4 @@
-"""Reading TOML files: one reader for configurations, fake arms and results, so that all accept the same files.
+"""The only reader of TOML files, so that configurations, fake arms and results follow the same rules.
 
 Text is UTF-8, with or without the byte order mark that some Windows programs write.
 """
@@ -13,7 +13,7 @@ from hil.description.regular_file import not_a_file
 
 
 class TomlFileError(ValueError):
-    """A file that cannot be read or is not TOML; the text is the whole message and names the file."""
+    """Raised if a file cannot be read or is not TOML; the text is the complete message and names the file."""
 
 
 def load_toml(path: Path) -> dict[str, Any]:
@@ -55,7 +55,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 
 def _encoding_of(path: Path, error: UnicodeDecodeError) -> str:
-    """Say what a file that is not UTF-8 text is, and how to save it as UTF-8."""
+    """Describe the contents of a file that is not UTF-8 text, and say how to save it as UTF-8."""
     data = path.read_bytes()
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and (b"=\0" in data or b"\0=" in data):
         return "UTF-16 text, as some Windows programs write it: save it as UTF-8"
@@ -67,7 +67,7 @@ def _encoding_of(path: Path, error: UnicodeDecodeError) -> str:
 
 
 def _not_toml(path: Path, error: Exception, text: str) -> str:
-    """The error message for a file with this text, which the TOML parser rejects: the line, and the likely cause."""
+    """The error message for text that the TOML parser rejects: the line, and the likely cause."""
     other = {".yaml": "YAML", ".yml": "YAML", ".json": "JSON", ".xml": "XML", ".urdf": "XML", ".csv": "CSV"}
     kind = other.get(path.suffix.lower())
     if kind is not None:
@@ -85,7 +85,7 @@ def _not_toml(path: Path, error: Exception, text: str) -> str:
 
 
 def _given_twice(error: str, text: str, number: int) -> str:
-    """Name the key or table that the statement ending on line `number` gives for a second time; "" for other errors."""
+    """Name the key or table that the statement ending on line `number` repeats; "" for other errors."""
     if not error.startswith(("Cannot overwrite", "Cannot declare")):
         return ""
     lines, begins = text.split("\n"), _beginnings(text)
@@ -112,7 +112,7 @@ def _given_twice(error: str, text: str, number: int) -> str:
 
 
 def _other_brackets(header: re.Match[str], lines: list[str], begins: list[int]) -> str:
-    """Say that the table of a header is given once as [name] and once as [[name]]; "" if it is not."""
+    """Say that the table of this header is given both as [name] and as [[name]]; "" if it is not."""
     at: dict[str, int] = {}
     for count in begins:
         other = _HEADER.match(lines[count - 1])
@@ -135,7 +135,7 @@ def _repeated(what: str, table: str, number: int, first: int | None) -> str:
 
 
 def _is_within(given: tuple[str, str], name: str) -> bool:
-    """Whether a table and key belong to the tables `name`; a header counts as a key of the table ""."""
+    """Whether a table and key belong to a table called `name`; a header counts as a key of the table ""."""
     table, key = given
     return re.match(rf"(?:the )?\[\[?{re.escape(name)}[\].]", table or key) is not None
 

@@ -1,7 +1,7 @@
 """Recognition of a number given in another unit: 10000 where seconds are expected may be 10 s in milliseconds.
 
-A key's unit is taken from its description: the first words ("N m/A at the output shaft"), in brackets
-("viscous friction [N m s/rad]"), or after a comma ("roll, pitch and yaw, rad").
+A key's unit is taken from its description: its first words ("N m/A at the output shaft"), the text
+in brackets ("viscous friction [N m s/rad]"), or the text after a comma ("roll, pitch and yaw, rad").
 """
 
 import math
@@ -47,7 +47,7 @@ is proposed.
 """
 
 _LEAST = {"m/s^2": 1.5, "m": 1e-2, "samples per second": 1.0}
-"""Smallest plausible magnitude in that unit, apart from 0: proposals below it would be misleading."""
+"""Smallest plausible magnitude in each unit, apart from 0: smaller proposals would be misleading."""
 
 _BY_LENGTH = sorted((re.escape(unit) for unit in OTHER_UNITS if unit != FRACTION), key=len, reverse=True)
 _IN_DESCRIPTION = re.compile(rf"(?:^|\[|, )(?:C\b|({'|'.join(_BY_LENGTH)}))(?! per N m)(?=$|[\],;: ])")

@@ -102,7 +102,7 @@ def _check_types(config: Any, out: Any, all_samples: Any) -> None:
 
 
 def are_recordings(paths: Sequence[Path]) -> bool:
-    """Whether the paths are recordings from other tools, not one run folder. Raises ValueError if mixed."""
+    """Whether the paths are recordings from other tools rather than one run folder. Raises ValueError if mixed."""
     if not paths:
         raise ValueError("no recording is given: name a run folder, or recordings (CSV, Parquet, MCAP).")
     files = [is_recording(path) for path in paths]
@@ -127,7 +127,7 @@ def _from_files(paths: list[Path], config: Path | None, out: PathLikeStr | None)
 
 
 def _discard(folder: Path) -> None:
-    """Remove a folder without a result. If it is already gone, the original error says so."""
+    """Remove a folder that holds no result. If it is already gone, the error being handled says so."""
     if not (folder / "result.json").is_file():
         with suppress(FileNotFoundError):
             for path in folder.iterdir():

@@ -52,11 +52,11 @@ def identify(
         take_over: take over an arm that another program left with its torque on, and lower it slowly; support it by
             hand.
         start_from: run folder or result.json of an earlier identification of the same arm. It replaces the prior,
-            so that fewer runs are needed; only with experiment.pilot. If the arm does not move as that result predicts,
+            so that fewer runs are needed; requires experiment.pilot. If the arm does not move as that result predicts,
             the prior is used.
         on_progress: called with a `Progress` about 20 times a second while the arm moves; on a real bus, in a separate
             thread. It cannot disturb the experiment: reports that arrive too fast are dropped. If it raises, the
-            exception is logged and it is not called again; a KeyboardInterrupt stops the run.
+            exception is logged and the function is not called again; a KeyboardInterrupt stops the run.
 
     Returns:
         The result, with the run folder as `run`. The report is in that folder too.
@@ -66,7 +66,7 @@ def identify(
         RunFolderError: `out` is not empty or cannot be written.
         ExperimentError: the experiment could not be finished; the subclass says why, for example SafetyStop when a
             limit was exceeded.
-        hil.drivers.errors.DriverError: the servos do not answer as they should.
+        hil.drivers.errors.DriverError: the servos do not answer, or answer incorrectly.
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
     """
     checked, shown = loaded(config)
@@ -154,7 +154,7 @@ def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: P
 @contextmanager
 def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
     """Remove the run folder if the experiment fails before the first sample, so that it does not block the next
-    attempt. After a stop, add to the exception what is kept and how to continue.
+    attempt. After a stop, add notes to the exception: what is kept and how to continue.
     """
     try:
         yield
@@ -180,7 +180,7 @@ def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None)
 
 
 def unused_path(path: Path) -> Path:
-    """Return `path`, with a number appended if it already exists, since a program may start two runs within a
+    """Return `path`, with a number appended if it already exists, since a program can start two runs within a
     second.
     """
     number = 2

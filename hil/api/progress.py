@@ -43,8 +43,8 @@ OnProgress = Callable[[Progress], None]
 def forgiving(listener: OnProgress) -> OnProgress:
     """Wrap a callback so that its first exception is logged and it is not called again.
 
-    A StopRequested or KeyboardInterrupt raised during the callback (Ctrl-C, for example) does not count as its failure
-    and is passed on.
+    A StopRequested or KeyboardInterrupt raised during the callback (Ctrl-C, for example) does not count as a failure of
+    the callback and is passed on.
     """
     if not callable(listener):
         raise TypeError(f"on_progress must be a function that takes one Progress, not {listener!r}.")

@@ -46,7 +46,7 @@ def near_by_design(space: Space) -> Iterator[str]:
 
 
 def _same_direction(config: Config, joint: JointConfig) -> str:
-    """Warn if both servos of a joint are set to turn the same way, which is rarely right; otherwise return ""."""
+    """Warn if both servos of a joint have the same direction setting, which is rarely right; otherwise return ""."""
     if len(joint.ids) == 1 or len(set(joint.directions)) > 1:
         return ""
     (first, second), sign = joint.ids, joint.direction
@@ -72,7 +72,7 @@ def _how_to_compare(config: Config) -> str:
 
 
 def _weak(joint: JointConfig) -> str:
-    """Warn if a joint's limit allows less torque than the typical friction of its servos; otherwise return ""."""
+    """Warn if a joint's limit allows no more torque than the typical friction of its servos; otherwise return ""."""
     friction = len(joint.ids) * servo_prior(joint.joint.servo).coulomb.median
     torque = joint.goal_limit * joint.torque_per_goal
     if torque > friction:

@@ -126,7 +126,7 @@ def _all_loop(chain: Any, shapes: Any, pairs: Any, q: Any, out: Any) -> None:
 def _least_loop(chain: Any, shapes: Any, pairs: Any, needed: Any, q: Any, room: Any, worst: Any) -> None:
     """For each pose, find the smallest difference between a pair's distance and its required distance.
 
-    Fills `room` (samples,) with that difference [m] and `worst` (samples,) with the index of the pair.
+    Fill `room` (samples,) with that difference [m] and `worst` (samples,) with the index of the pair.
     """
     rotation, translation, axis = chain
     link, ends, radius, floor, boxes = shapes

@@ -156,7 +156,7 @@ def _of_geom(geom: Geom) -> list[tuple[Array, float]]:
 
 
 def _pieces(capsule: Capsule) -> list[Capsule]:
-    """Split a capsule, because the piece next to a joint may touch a link that the other pieces must not touch."""
+    """Split a capsule, because the piece next to a joint is allowed to touch a link that the other pieces must not."""
     length = float(np.linalg.norm(capsule.ends[1] - capsule.ends[0]))
     if not length < np.inf:
         return [capsule]  # rejected by `shapes_of`
@@ -166,7 +166,7 @@ def _pieces(capsule: Capsule) -> list[Capsule]:
 
 
 def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Capsule], list[str]]:
-    """Capsules around everything fixed to one moving link, and why any shapes could not be read."""
+    """Capsules around everything fixed to one moving link, and, if shapes could not be read, the reasons."""
     found, unread = [], []
     for _, rotation, translation, element in here:
         if element is None:
@@ -218,7 +218,7 @@ def _geometry(link: ET.Element) -> Iterator[tuple[ET.Element, Array, Array]]:
 
 
 def _of_shape(shape: ET.Element, arm: ArmDescription) -> list[tuple[Array, float]] | None:
-    """Ends (2, 3) and radii of capsules that enclose a shape; None if no such shape is known. Raises UnreadMesh."""
+    """Ends (2, 3) and radii of capsules that enclose a shape; None if its type is unknown. Raises UnreadMesh."""
     if shape.tag == "sphere":
         return [(np.zeros((2, 3)), float(shape.get("radius", "nan")))]
     if shape.tag == "cylinder":
@@ -292,6 +292,6 @@ def _origin(element: ET.Element) -> tuple[Array, Array]:
 
 
 def _numbers(text: str | None, count: int, default: float = float("nan")) -> list[float]:
-    """Parse `count` numbers: all defaults if there is no text, all NaN if their count differs."""
+    """Parse `count` numbers: all defaults if there is no text, all NaN if it holds more or fewer numbers."""
     found = [default] * count if text is None else [float(word) for word in text.split()]
     return found if len(found) == count else [float("nan")] * count

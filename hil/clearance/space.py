@@ -29,12 +29,12 @@ they must not touch, but need no margin. The first value applies if one link lie
 
 BUILT_NEAR = 0.02  # m beyond the margin
 TOUCHED = 0.02
-"""Capsules closer than this in the rest pose may support the arm there [m]."""
+"""Capsules closer than this in the rest pose might support the arm there [m]."""
 
 RANDOM_POSES = 400
 AT_REST_SLACK = 0.008
-"""If a pair is closer than the margin in the rest pose, it may come closer still, by up to this distance [m], on the
-way to or from that pose.
+"""If a pair is closer than the margin in the rest pose, it is allowed to come closer still, by up to this distance
+[m], on the way to or from that pose.
 """
 
 AT_REST_INSIDE = 0.02
@@ -84,7 +84,7 @@ class Space:
     at_rest: Array
     """Distance of each pair in the rest pose (pairs,) [m]."""
     is_touched: Mask
-    """Whether, in the rest pose, anything may touch the part of the arm that each joint moves (joints,)."""
+    """Whether, in the rest pose, anything might touch the part of the arm that each joint moves (joints,)."""
     _built: Array
     """Median distance of pairs that are near each other by design, otherwise infinite (pairs,) [m]."""
     _pairs: NDArray[np.int64]
@@ -100,12 +100,12 @@ class Space:
     def room(self, position: Array, on_the_way: bool = False) -> Array:
         """Smallest distance minus required distance in each sample (samples,) [m] of a motion (joints, samples) [rad].
 
-        on_the_way: whether the motion leads from or to the rest pose; distances may then be less than the margin.
+        on_the_way: whether the motion leads from or to the rest pose; distances less than the margin are then allowed.
         """
         return self._least(position, self._needed(on_the_way), on_the_way)[0]
 
     def has_reserve(self, position: Array, reserve: float) -> bool:
-        """Whether a motion (joints, samples) [rad] keeps `reserve` [m] more than the required distance.
+        """Whether a motion (joints, samples) [rad] keeps `reserve` [m] beyond the required distance.
 
         For pairs near each other by design, half of their median distance is enough.
         """
@@ -255,7 +255,7 @@ def _space(key: _Key) -> Space:
 
 
 def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool) -> list[tuple[int, int]]:
-    """Pairs to check: capsules of non-adjacent links, capsules and boxes, and capsules and the floor.
+    """Pairs to check: two capsules of non-adjacent links, a capsule and a box, or a capsule and the floor.
 
     The base and the first link, which is mounted on it, are not checked against the floor.
     """
@@ -287,8 +287,8 @@ def _by_design(
 
 
 def _touched(joints: int, link: NDArray[np.int64], contacts: NDArray[np.int64]) -> Mask:
-    """For each joint (joints,): whether a contact (contacts, 2) is between a part that it moves and one that it does
-    not.
+    """For each joint (joints,): whether any contact (contacts, 2) is between a part that it moves and a part that it
+    does not move.
     """
     touched = np.zeros(joints, dtype=bool)
     for first, second in contacts:

@@ -74,7 +74,7 @@ ALLOW_CODE = "--allow-code"
 
 @contextmanager
 def _code_as_asked() -> Iterator[None]:
-    """Accept --allow-code anywhere on the command line: any subcommand may open a file whose [fake] table names a
+    """Accept --allow-code anywhere on the command line: any subcommand can open a file whose [fake] table names a
     function.
     """
     words = sys.argv[1:]
@@ -106,7 +106,7 @@ def _one_blas_thread() -> None:
     """Limit BLAS to one thread unless the user chose a number. BLAS reads the number when numpy is first imported.
 
     hil's matrices are small. On two busy cores, two spinning threads took 91 ms for a singular value decomposition that
-    takes one thread 1 ms.
+    took one thread 1 ms.
     """
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")

@@ -84,7 +84,7 @@ def pose(
     ] = False,
     json_only: Json = False,
 ) -> None:
-    """Show the pose of a URDF or MJCF arm as read from the bus; --guide checks each joint by hand. Torque stays off."""
+    """Show the pose of a URDF or MJCF arm as read from the bus; --guide: check each joint by hand. Torque stays off."""
     from hil import fakes
     from hil.cli.views.pose_view import moved_values, pose_values, print_moved, print_pose
     from hil.config.schema import load_config

@@ -12,7 +12,7 @@ _OF_THE_MACHINE = frozenset({errno.EMFILE, errno.ENFILE})
 """Operating-system errors that do not depend on the input: too many open files."""
 
 _OF_A_PATH = frozenset({errno.ENAMETOOLONG, errno.EACCES})
-"""Errors that even checking whether a file exists may raise."""
+"""Errors that even a check for the existence of a file can raise."""
 
 
 def exit_code(error: Exception) -> int | None:
@@ -43,7 +43,7 @@ def message(error: Exception) -> str:
     """Return the text to print for an error: its message and its notes.
 
     If the error occurred while another expected error was being handled, the message of that error is included, unless
-    it is the same. If the notes name a command to type next, they end with it. Control characters are escaped.
+    it is the same. If the notes name a command to type next, it comes last. Control characters are escaped.
     """
     said = str(error)
     if isinstance(error, OSError) and _is_of_a_path(error):
@@ -75,7 +75,7 @@ class Command(TyperCommand):
 def stop_behind(error: BaseException) -> Exception | None:
     """Return the stop request that was being handled when a closed terminal caused `error`; None if there was none.
 
-    A closed terminal sends SIGHUP, and then rejects any output.
+    Closing a terminal sends SIGHUP; from then on, it rejects all output.
     """
     from hil.errors import StopRequested
 

@@ -59,7 +59,7 @@ def identify(
     live: Live = "terminal",
     json_only: Json = False,
 ) -> None:
-    """Excite the arm, record one settled period, and print its parameters with error bars."""
+    """Excite the arm, record one settled period, and print the arm's parameters with error bars."""
     from hil.api.experiment import identify as identify_arm
 
     with _watching(config, live, json_only) as follow:

@@ -47,7 +47,7 @@ def list_faults() -> None:
 
 
 def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
-    """Move or release joints of the fake arm served at `device`. They move only while torque is off. Raises
+    """Move or release joints of the fake arm served at `device`. They move only while their torque is off. Raises
     ConfigError.
     """
     try:

@@ -66,7 +66,7 @@ def hand(
     ] = None,
     release: Annotated[list[int] | None, typer.Option(metavar="ID", help="Release this servo's joint.")] = None,
 ) -> None:
-    """Move joints of a fake arm while their torque is off, like a person calibrating an arm by hand."""
+    """Move joints of a fake arm while their torque is off, as a person does when calibrating an arm by hand."""
     from hil.cli import fake as work
 
     work.move_by_hand(device, moves or [], release or [])

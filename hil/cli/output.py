@@ -14,10 +14,10 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 PATIENCE_S = 3.0
-"""Time after a signal in which a terminal or pipe must take some output [s]; the rest is then discarded."""
+"""Time after a signal within which a terminal or pipe must accept some output [s]; otherwise the rest is discarded."""
 
 _PIECE, _POLL_S = 256, 0.1
-"""Number of bytes written at once, so that no write blocks for long, and the interval between two looks [s]."""
+"""Number of bytes written at once, so that no write blocks for long, and the interval between two checks [s]."""
 
 
 def require_output() -> None:
@@ -47,10 +47,10 @@ def readable_output() -> Iterator[None]:
 
 @contextmanager
 def bounded_output() -> Iterator[None]:
-    """Let the program end after a signal although its terminal is stopped (Ctrl-S) or nobody reads its output.
+    """Let the program end after a signal even if its terminal is stopped (Ctrl-S) or nobody reads its output.
 
-    Until a signal arrives, output waits for as long as it takes. Only terminals and pipes are treated so, in a main
-    thread: the files of a run folder are complete, and closed, without them.
+    Until a signal arrives, output waits indefinitely. Only terminals and pipes are handled in this way, and only in
+    the main thread: the files of a run folder are completed and closed without them.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -74,7 +74,7 @@ def bounded_output() -> Iterator[None]:
 
 
 def _bounded(stream: Any, patience: "_Patience") -> Any:
-    """Return a stream to the same terminal or pipe that gives up as `patience` says; any other stream as it is."""
+    """Return a stream to the same terminal or pipe that waits no longer than `patience`; any other stream unchanged."""
     try:
         number = stream.fileno()
         mode = os.fstat(number).st_mode
@@ -88,7 +88,7 @@ def _bounded(stream: Any, patience: "_Patience") -> Any:
 
 
 class _Patience:
-    """How long output waits for its reader: without bound until a signal arrives, `PATIENCE_S` from then on.
+    """How long output waits for its reader: indefinitely until a signal arrives, `PATIENCE_S` from then on.
 
     heard: file descriptor from which a byte can be read once a signal has arrived.
     """
@@ -96,7 +96,7 @@ class _Patience:
     def __init__(self, heard: int) -> None:
         self._heard = heard
         self._since: float | None = None
-        """Since when nothing could be written after a signal [s]."""
+        """Time of the signal or of the last write after it [s]; None before a signal."""
 
     def is_over(self) -> bool:
         """Whether output that cannot be written now is discarded."""
@@ -105,13 +105,13 @@ class _Patience:
         return self._since is not None and time.monotonic() - self._since >= PATIENCE_S
 
     def made_progress(self) -> None:
-        """Begin to wait anew."""
+        """Restart the wait."""
         if self._since is not None:
             self._since = time.monotonic()
 
 
 class _Bounded(io.RawIOBase):
-    """Writes to a terminal or pipe in pieces that do not block, and discards what `patience` does not let wait."""
+    """Writes to a terminal or pipe in pieces that do not block, and discards the output once `patience` is over."""
 
     def __init__(self, number: int, patience: _Patience) -> None:
         super().__init__()

@@ -12,7 +12,7 @@ from hil import strict_json
 from hil.cli.options import Json, RunPath
 
 _WHOLE = 100.0
-"""Detectable change [%] above which the output gives no figure, because the runs reveal nothing about that term."""
+"""Detectable change [%] above which no value is printed for a term, because the runs reveal nothing about it."""
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -134,7 +134,7 @@ def _print_difference(difference: "Difference") -> None:
 
 
 def _would_show(detectable: "Mapping[str, float]") -> list[str]:
-    """Describe the smallest change in each friction term alone that two runs like these would reveal [%, by name]."""
+    """Describe the smallest change [%] that two runs like these would reveal if only one friction term changed."""
     least = [f"{name} {percent:.2g} %" for name, percent in detectable.items() if percent <= _WHOLE]
     never = [name for name, percent in detectable.items() if percent > _WHOLE]
     lines = []

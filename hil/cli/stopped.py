@@ -50,7 +50,7 @@ def how_to_go_on(stopped: BaseException) -> list[str]:
 
 
 def same_again(stopped: BaseException) -> list[str]:
-    """Return a list with one line that suggests the same command again; empty if the notes attached to the
+    """Return a list with one line that suggests repeating the command; empty if the notes attached to the
     interruption name a next command.
     """
     notes = getattr(stopped, "__notes__", [])

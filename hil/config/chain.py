@@ -35,7 +35,7 @@ _OPTIONS = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable
 
 
 def described_arm(config: "Config") -> ArmDescription:
-    """Describe the arm of `[arm] urdf` with the joints of the configuration. Raises ArmFileError."""
+    """Read the description in `[arm] urdf` of the arm formed by the configured joints. Raises ArmFileError."""
     assert config.arm.urdf is not None
     return _read(config.arm.urdf, tuple(joint.name for joint in config.joints), _changed(config.arm.urdf))
 
@@ -48,7 +48,7 @@ def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
 def doubted_limits(config: "Config") -> Iterator[str]:
     """Yield one sentence per joint whose limits in the description make no sense or do not contain its path.
 
-    position_limit may exceed the described limits at either end by the margin that a path leaves free.
+    position_limit is allowed to exceed the described limits at either end by the margin that a path leaves free.
     """
     arm = described_arm(config)
     wanted = config.joint_path

@@ -5,7 +5,7 @@ time = "time"                                     # in seconds unless time_unit 
 position = ["pos_meas1", "pos_meas2"]             # one per joint
 torque = ["tau_meas1", "tau_meas2"]               # or current, which needs torque_constant
 position_unit = "rad"                             # rad, deg, turns
-zero = [-1.5707963, 0.0]                          # rad added to the column: joint 1 from the horizontal
+zero = [-1.5707963, 0.0]                          # rad added to the column: joint 1 is measured from the horizontal
 """
 
 import re

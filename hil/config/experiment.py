@@ -82,7 +82,7 @@ class ExperimentConfig(Table):
     def drift_within(self) -> float:
         """Limit on the difference between periods for motion that is still drifting slowly after max_settling_periods.
 
-        Relative to the motion's RMS, like settle_within. Warming grease, for example, makes the motion drift.
+        Like settle_within, it is relative to the motion's RMS. Warming grease, for example, makes the motion drift.
         """
         return DRIFT * self.settle_within
 

@@ -18,7 +18,7 @@ _REF = "#/$defs/{model}"
 
 
 class _Untitled(GenerateJsonSchema):
-    """Omits field titles, because pydantic's only repeat the keys and would make up a tenth of the file."""
+    """Omits field titles, because pydantic's titles only repeat the keys and would make up a tenth of the file."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False

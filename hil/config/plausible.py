@@ -26,7 +26,7 @@ of the usual value.
 
 _MOST_ROTOR = 1e-4  # kg m^2, on the motor's side of the gears
 _GEAR = 8.0
-"""Largest plausible ratio of a torque constant to the published one, for an external gear or a very rough guess."""
+"""Largest plausible ratio of a torque constant to the published one, with an external gear or a very rough guess."""
 
 _SPEED = 4.0
 """Largest plausible ratio of the velocity limit to the no-load speed at the highest published supply voltage."""

@@ -1,4 +1,4 @@
-"""Description of an arm whose recording was made elsewhere: its columns, and some properties of the arm.
+"""Description of an arm whose recording was made elsewhere: the recording's columns, and some properties of the arm.
 
 The TOML file of an experiment can be used, or a shorter one; tables and keys that only an experiment needs are
 ignored, unknown ones are errors.

@@ -135,7 +135,7 @@ class _Tree:
         return None if (x, y, z) == USUAL_GRAVITY else (x, y, z)
 
     def not_modelled(self, names: list[str], bodies: list[int]) -> Iterator[str]:
-        """Yield one sentence per kind of force in the file that the model, rigid links with friction, does not
+        """Yield one sentence per kind of force in the file that the model (rigid links with friction) does not
         include.
         """
         model = self.model

@@ -1,4 +1,4 @@
-"""Where a described arm is, and which way each joint moves it, in terms that a person can compare with the real arm."""
+"""The pose of a described arm, and how each joint moves it, in terms that a person can compare with the real arm."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ def axis_of(arm: ArmDescription, angles: Array, joint: int) -> tuple[Array, Arra
 
 
 def moves(arm: ArmDescription, angles: Array, joint: int, up: Array | tuple[float, float, float] = UPRIGHT) -> str:
-    """Describe in words which way a positive angle of a joint moves or turns the arm's end.
+    """Describe in words in which direction a positive angle of a joint moves or turns the arm's end.
 
     up: the direction opposite to gravity in the base's frame (3,).
     """
@@ -37,8 +37,8 @@ def moves(arm: ArmDescription, angles: Array, joint: int, up: Array | tuple[floa
 
 
 def _towards(vector: Array, up: Array) -> str:
-    """Name the base's axis that is nearest to a vector, and the direction of this axis for an observer next to the
-    arm.
+    """Name the base's axis that is nearest to a vector, and the direction of this axis as seen by an observer next
+    to the arm.
 
     The observer looks along the base's x axis or, if that is vertical, along its z axis.
     """

@@ -1,11 +1,11 @@
-"""Recognition of pipes and devices, whose contents may never end or never come."""
+"""Recognition of pipes and devices, whose contents may never end or never arrive."""
 
 from pathlib import Path
 from stat import S_ISDIR, S_ISREG
 
 
 def not_a_file(path: Path) -> str:
-    """Say that a path is a pipe or a device; "" if it is not, or if nothing is there."""
+    """Say that a path is a pipe or a device; "" if it is neither or does not exist."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):

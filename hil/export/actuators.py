@@ -9,9 +9,9 @@ from hil.export.xml_text import comment, numbers
 
 def add_actuators(root: ET.Element, model: ArmModel | ChainArmModel) -> None:
     """Add actuators controlled by a goal [A, or V in pwm mode]: the gain gives the torque, the bias the offset, and the
-    filter the drive's lag. Each actuator has the name of its joint.
+    filter the drive's lag. Each actuator is named after its joint.
 
-    A cable is exported as the joint's own stiffness; a negative one is part of the bias.
+    A cable is exported as the joint's own stiffness; a negative stiffness is part of the bias.
     """
     actuators = ET.SubElement(root, "actuator")
     units = ", ".join(f"{joint.name} [{joint.goal_unit}]" for joint in model.joints)

@@ -1,7 +1,7 @@
 """URDF and MJCF of an identified spatial arm.
 
-The URDF is the one used for the identification: names, frames, limits and meshes are kept; inertias, damping and
-friction of the arm's joints are replaced. The MJCF is written from its geometry.
+The URDF is the one used for the identification: names, frames, limits and meshes are kept; inertias, and the
+damping and friction of the arm's joints, are replaced. The MJCF is written from the URDF's geometry.
 """
 
 from collections.abc import Sequence

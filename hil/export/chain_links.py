@@ -73,8 +73,8 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
 def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
     """Separate a link from the parts that its held joints move, such as gripper fingers, which keep their inertia.
 
-    If their described masses leave no physically possible body for the link itself, they keep a common fraction, halved
-    until a body is possible. Returns the link's body and that fraction.
+    If the described masses of these parts leave no physically possible body for the link itself, they are multiplied by
+    a common fraction, which is halved until a body is possible. Returns the link's body and that fraction.
     """
     share = 1.0
     for _ in range(HALVINGS):
@@ -106,10 +106,10 @@ def _same_word(one: str, other: str) -> bool:
 
 
 def _rotor(model: ChainArmModel, number: int) -> float:
-    """A joint's rotor inertia [kg m^2]: as identified or, if only a sum containing it was identified, typical of its
-    servos.
+    """A joint's rotor inertia [kg m^2]: as identified or, if only a sum containing it was identified, the typical
+    value for its servos.
 
-    If this guess is far too small, the link has to be far too heavy to compensate.
+    If the typical value is far too small, the exported link becomes far too heavy.
     """
     if (known := model.values.get(f"armature_{number}", 0.0)) > 0.0:
         return known

@@ -77,7 +77,7 @@ def export(run: Path, name: str, out: Path | None = None, link_length: float | N
 
 
 def _not_its_own(run: Path, out: Path | None, default: str) -> Path:
-    """Return the file to write: never one of the run's own files, such as its arm.urdf. Raises ExportError."""
+    """Return the file to write. Raises ExportError if `out` is one of the run's own files, such as its arm.urdf."""
     path = out or run / default
     if path.parent.resolve() != run.resolve() or path.name not in RunFolder(run).own_files():
         return path

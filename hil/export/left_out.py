@@ -11,15 +11,15 @@ _SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torq
 
 
 def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:
-    """One sentence per model parameter that the format cannot represent; `carried` names terms that it can."""
+    """One sentence per model parameter that the format cannot represent. carried: terms that it can represent."""
     elsewhere = (*_SAID_ELSEWHERE, *carried)
     return [_sentence(name, value) for name, value in model.values.items() if kind_of(name) not in elsewhere]
 
 
 def chain_left_out(model: ChainArmModel, carried: tuple[str, ...] = ()) -> list[str]:
-    """One sentence per parameter of a spatial arm that the format cannot represent; `carried` names terms that it can.
+    """One sentence per parameter of a spatial arm that the format cannot represent.
 
-    The links in the file represent all base parameters.
+    The links in the file represent all base parameters. carried: other terms that the format can represent.
     """
     elsewhere = {*_SAID_ELSEWHERE, *carried}
     names = [name for name in model.values if name not in model.groups and kind_of(name) not in elsewhere]

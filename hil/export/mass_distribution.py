@@ -1,7 +1,7 @@
 """Masses, centres of mass and inertias that have exactly the identified base parameters.
 
-Torque and position determine sums such as m2 l1 c2, never a single mass. URDF and MJCF need masses, so one distribution
-is chosen among all dynamically equivalent ones (m mass, c centre, J inertia about the centre, l length):
+Torque and position determine combinations such as m2 l1 c2, never a single mass. URDF and MJCF need masses, so one
+distribution is chosen among all dynamically equivalent ones (m mass, c centre, J inertia about the centre, l length):
 
     l1      = coupling g / gravity_2, as can be checked with a ruler; for a horizontal arm, the user must give it
     link 2  first moment m2 c2 = gravity_2 / g = coupling / l1, second moment m2 c2^2 + J2 = inertia_2

@@ -1,9 +1,9 @@
 """Arms drawn from the posterior of an identification, for domain randomisation: one file per arm, one table for all.
 
-The parameters are drawn from a normal distribution with their covariance. One factor common to all torques is also
-drawn, because the torque constant is known far less accurately than anything else. The motion reveals the ratios of the
-joints' constants, so a single factor remains, as uncertain as the best-known joint's constant. The torque per goal [A
-or V] is scaled with it, so that all drawn arms respond equally to the same goals.
+The parameters are drawn from a normal distribution with the estimated covariance. One factor common to all torques
+is also drawn, because the torque constant is known far less accurately than anything else. The motion reveals the
+ratios of the joints' constants, so a single factor remains, as uncertain as the best-known joint's constant. The torque
+per goal (in A or V) is scaled with it, so that all drawn arms respond equally to the same goals.
 """
 
 from collections.abc import Sequence
@@ -103,7 +103,7 @@ def export_samples(
 
 
 def _nothing_older(formats: Sequence[str], out: Path, samples: int) -> None:
-    """Raise ExportError if arms of an earlier draw would remain in the folder next to the new ones."""
+    """Raise ExportError if arms from an earlier draw would remain in the folder next to the new ones."""
     for name in formats:
         if name in FORMATS:
             ending = FORMATS[name][1]

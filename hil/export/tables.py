@@ -13,7 +13,7 @@ from hil.model_file import model_of
 
 
 def export_csv(source: Recorded, path: Path) -> list[str]:
-    """Write `path` with all digits; missing values are written as nan."""
+    """Write `path` at full precision; missing values are written as nan."""
     table = columns(source)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

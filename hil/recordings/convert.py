@@ -31,8 +31,8 @@ class Converted:
     """Recordings in SI units.
 
     names: one per recording. stepped: whether each joint's encoder resolution is known. columns: description of the
-    columns, including guesses. notes: one sentence per guess or correction. doubts: one per contradiction among the
-    columns. unusable: whether a contradiction is so large that a model is useless.
+    columns, including guesses. notes: one sentence per guess or correction. doubts: one sentence per contradiction
+    among the columns. unusable: whether a contradiction is so large that a model would be useless.
     """
 
     recordings: tuple[Recording, ...]
@@ -52,7 +52,7 @@ def convert(table: Table, columns: Columns) -> Converted:
     """
     whole = guessed(table, columns)
     notes = [] if whole == columns else [said(whole, table)]
-    assert whole.position is not None and whole.drive is not None  # or guessed would have raised
+    assert whole.position is not None and whole.drive is not None  # or `guessed` would have raised CsvError
     notes += _unused(table, whole)
     time = _time(table, whole)
     ticks = 0.0 if whole.ticks_per_turn is None else 2.0 * np.pi / whole.ticks_per_turn
@@ -100,7 +100,7 @@ def convert(table: Table, columns: Columns) -> Converted:
 
 
 def _unused(table: Table, columns: Columns) -> list[str]:
-    """State which keys of [columns] have no effect, since that of a wrong key would be missed."""
+    """State which keys of [columns] have no effect, so that a mistaken key does not go unnoticed."""
     stated = [columns.position_unit, *(unit_of(table.find(name)[2] or "") for name in columns.position or ())]
     unused = [f"columns.{key}" for key in columns.without_effect(in_ticks=TICKS in stated)]
     if not unused:
@@ -110,7 +110,7 @@ def _unused(table: Table, columns: Columns) -> list[str]:
 
 
 def _steps(found: Sequence[float | None], position: Values) -> Values:
-    """The encoder steps (joints,); one that a joint moves too little to show is assumed to equal another joint's."""
+    """The encoder steps (joints,); if a joint moves too little to show its own, it is given that of another joint."""
     known = max((each for each in found if each is not None), default=SMALLEST_STEP)
     swing = np.nanmax(position, axis=1, initial=-np.inf) - np.nanmin(position, axis=1, initial=np.inf)
     other = np.where(swing < LEAST_MOTION * known, known, SMALLEST_STEP)

@@ -29,7 +29,7 @@ def encoder_step(position: Array) -> float | None:
 
 
 def _refined(away: Array, step: float) -> float | None:
-    """Refine a step by regression on integers, from near readings to far ones; None if not all are whole steps."""
+    """Refine a step by regression on integers, from near to far readings; None if too few are whole steps apart."""
     reach = 20.0 * step
     while True:
         near = away <= reach

@@ -16,7 +16,7 @@ UNSUPPORTED = (".db3", ".bag", ".h5", ".hdf5", ".xlsx", ".mat", ".npz", ".npy", 
 
 
 def is_recording(path: Path) -> bool:
-    """Whether `path`, by its name, is a recording from another tool rather than a run folder."""
+    """Whether `path`, judging from its name, is a recording from another tool rather than a run folder."""
     if path.is_dir():
         return is_dataset(path) or is_bag(path)
     return path.suffix.lower() in (*SUFFIXES, *UNSUPPORTED)

@@ -74,7 +74,7 @@ def said(columns: Columns, table: Table) -> str:
 
 
 def _described(kind: str, names: Sequence[str], columns: Columns, table: Table) -> str:
-    """The columns' names, with their unit if the header does not state it."""
+    """The columns' names, with their units if the header does not state them."""
     given = getattr(columns, f"{kind}_unit", None)
     if given is not None:
         return f"{', '.join(names)} [{given}]"
@@ -135,7 +135,7 @@ def _spaced(name: str) -> str:
 
 
 def _stem(name: str) -> str:
-    """The part of a column's name that all joints share: all but the joint's number, or all before the last dot."""
+    """The part of a column's name that all joints share: all except the joint's number, or all before the last dot."""
     numbered = re.sub(r"\d+", "#", name)
     if numbered != name:
         return numbered
@@ -186,7 +186,7 @@ def _quoted(name: str) -> str:
 
 
 def _kind(name: str, words: str) -> str:
-    """The kind of a column by its name: "other" if it is certainly not needed, "unknown" if that is not clear."""
+    """The kind of column that its name suggests: "other" if certainly not needed, "unknown" if the name is unclear."""
     if _TIME.fullmatch(_last(name)):
         return "time"
     found = next((kind for kind, pattern in _KINDS.items() if pattern.search(words)), "unknown")

@@ -1,4 +1,4 @@
-"""Reduction of a recording with periodic torque to the mean period of its settled part, which saves simulation and
+"""Reduction of a recording with periodic torque to the mean period of its settled part, which saves simulation time and
 averages out noise.
 """
 

@@ -52,7 +52,7 @@ def rates(table: Table, time: Array, position: Array) -> tuple[Rate, ...]:
 
 
 def contradict(found: Sequence[Rate]) -> bool:
-    """Whether velocities contradict positions so much that a model of one of them is useless."""
+    """Whether velocities contradict positions so strongly that a model based on either would be useless."""
     return any(abs(math.log(factor)) > FAR_APART for factor in _factors(found))
 
 

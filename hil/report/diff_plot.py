@@ -36,7 +36,7 @@ def save_diff_plot(difference: Difference, path: Path) -> None:
 
 
 def _interval(change: Change) -> tuple[float, float] | None:
-    """Change and half-width of its 95 % interval [% of the value before]; None if undefined or too wide to show."""
+    """Change and half-width of its 95 % interval [% of the earlier value]; None if undefined or too wide to show."""
     if change.percent is None or not change.before:
         return None
     half = _WIDTH_OF_95 * 100 * (change.before_std**2 + change.after_std**2) ** 0.5 / abs(change.before)

@@ -111,7 +111,7 @@ def figures_in(shown: Sequence[Section]) -> list[Figure]:
 
 
 def _share_of_points(shown: Sequence[Section]) -> float:
-    """Fraction of the points that each curve may have, so that a page with many joints stays small."""
+    """Fraction of its points to which each curve is reduced, so that a page with many joints stays small."""
     charts = [figure for figure in figures_in(shown) if isinstance(figure, Chart)]
     wanted = sum(min(len(series.x), WIDE.points) for chart in charts for series in chart.series)
     return min(1.0, MOST_POINTS / max(1, wanted))

@@ -1,6 +1,6 @@
 """An arm's motion as data for the page: geometry once, then angles and, for spatial arms, clearances, frame by frame.
 
-The page's scripts place the links themselves, so that a motion of minutes takes a few hundred kilobytes.
+The page's scripts place the links themselves, so that a motion of several minutes takes only a few hundred kilobytes.
 """
 
 from typing import Any
@@ -38,8 +38,8 @@ def spatial_motion(
 ) -> SpatialMotion:
     """The motion (joints, samples) [rad] of a configured spatial arm.
 
-    ways: number of samples at the beginning and at the end that lead from and to the rest pose, in which parts may be
-    closer than the margin. Raises ConfigError, ArmFileError.
+    ways: number of samples at the beginning and at the end that lead from and to the rest pose, where distances less
+    than the margin are allowed. Raises ConfigError, ArmFileError.
     """
     space = Space.of(config)
     step = _frame_step(position)
@@ -90,7 +90,7 @@ def _capsules(space: Space) -> list[dict[str, Any]]:
 
 
 def _extent(space: Space, angles: Array, upright: Array) -> tuple[Array, float]:
-    """Centre and radius [m] of a sphere around the arm in all its poses and the boxes, in the upright frame."""
+    """Centre and radius [m] of a sphere around the boxes and the arm in all its poses, in the upright frame."""
     every = np.linspace(0, angles.shape[1] - 1, min(FEW_POSES, angles.shape[1])).astype(int)
     ends = np.concatenate([space.ends(angles[:, frame])[0].reshape(-1, 3) for frame in every] + [np.zeros((1, 3))])
     radius = max((each.radius for each in space.shapes.capsules), default=0.0)

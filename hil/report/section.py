@@ -54,7 +54,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class SpatialMotion:
-    """An animated spatial arm that can be rotated. caption: what is shown. scene: data of the page's script (JSON
+    """An animated spatial arm that can be rotated. caption: what is shown. scene: data for the page's script (JSON
     types).
     """
 

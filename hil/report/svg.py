@@ -99,7 +99,7 @@ def _path(series: Series, x: Scale, y: Scale, points: int) -> str:
 
 
 def _polyline(across: Array, up: Array) -> str:
-    """A path through the points, interrupted where a height is not finite."""
+    """A path through the points, interrupted where `up` is not finite."""
     text, pen = [], "M"
     for at, height in zip(across.tolist(), up.tolist(), strict=True):
         if np.isfinite(height):

@@ -1,7 +1,7 @@
 """Lossless conversion of frozen dataclasses to JSON values and back. Standard library only, so that models load fast.
 
 A field is stored under its own name, or under the name in its metadata entry "key". A field with False in its metadata
-entry "json" is not stored. An optional field whose default is None is omitted while it is None. Unknown keys are
+entry "json" is not stored. An optional field whose default is None is omitted if it is None. Unknown keys are
 ignored when reading.
 
 JSON has no infinity and no NaN: they are written as null, which is read as NaN, or as infinity in a `Spread`.
@@ -28,8 +28,8 @@ T = TypeVar("T")
 
 
 class FormError(ValueError):
-    """A JSON value does not match the dataclass. The message continues a sentence that starts with "it", such as "has
-    no 'arm'".
+    """A JSON value does not match the dataclass. The message, such as "has no 'arm'", continues a sentence that
+    starts with "it".
     """
 
 

@@ -147,7 +147,7 @@ class LineLevels:
 
 @dataclass(frozen=True)
 class Validation:
-    """How well the model predicts, per joint; None if that was not checked.
+    """How well the model predicts, per joint; None for what was not checked.
 
     held_out_rms: open-loop prediction error of a held-out multisine, encoder noise included, relative to the motion's
     RMS (the verdict excludes the noise); if friction has changed since the fitted multisine, the model's friction is
@@ -184,7 +184,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class TriedModel:
-    """One of the friction models that were tried. held_out_rms and score are None if the model could not be judged."""
+    """One of the friction models that were tried. held_out_rms and score are None if it could not be evaluated."""
 
     model: str
     parameters: int
@@ -198,7 +198,7 @@ class ModelChoice:
     """The model chosen with friction = "auto", and its gain and cost.
 
     error_divided_by: prediction error of the model with the fewest parameters divided by that of the chosen one.
-    standard_errors_times: factor by which the standard errors grew; None if that was not compared.
+    standard_errors_times: factor by which the standard errors grew; None if they were not compared.
     """
 
     chosen: str
@@ -208,7 +208,7 @@ class ModelChoice:
 
     @property
     def plainest(self) -> str:
-        """The model with the fewest parameters among those that could be judged."""
+        """The model with the fewest parameters among those that could be evaluated."""
         judged = [trial for trial in self.tried if trial.score is not None]
         return min(judged, key=lambda trial: trial.parameters).model if judged else self.chosen
 
@@ -301,7 +301,7 @@ class PhysicalQuantity(Quantity):
 
 @dataclass(frozen=True)
 class Physical:
-    """Masses, centres of mass and inertias, using [known]. not_told_apart: groups of quantities that cannot be
+    """Masses, centres of mass and inertias, derived with [known]. not_told_apart: groups of quantities that cannot be
     separated unless another quantity is known.
     """
 
@@ -320,7 +320,7 @@ class StabiliserShare:
 
     @property
     def share(self) -> PerJoint:
-        """RMS of the stabiliser relative to that of the total torque, per joint; may exceed 1."""
+        """RMS of the stabiliser relative to that of the total torque, per joint; can exceed 1."""
         return tuple(rms / max(whole, 1e-12) for rms, whole in zip(self.rms, self.commanded_rms, strict=True))
 
     def said(self, names: Sequence[str]) -> str:

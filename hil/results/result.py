@@ -5,8 +5,8 @@ parameters   the base parameters: value, std (null in the file if there is no in
 extra        further model terms (shape of the friction curve, lag of the drive): value, std, unit
 covariance   of parameters and extra together, rows in the order of `names`
 fit          residual in encoder steps, and the effect of encoder rounding
-validation   open-loop prediction of another multisine and of this one, relative to the motion's RMS; residual relative
-             to rounding, whiteness, conditioning; noise, distortion and model error in encoder steps
+validation   open-loop prediction of another multisine and the fitted one, relative to the motion's RMS; residual
+             relative to rounding, whiteness, conditioning; noise, distortion and model error in encoder steps
 verdict      whether to trust the result, the weakest parameter, and the reasons as sentences
 warnings     problems of the recording, as sentences
 model_choice with friction = "auto": the models tried, the one chosen, its gain and cost
@@ -15,7 +15,7 @@ arm          data needed to use the model: gravity, rest pose, and, for each joi
              per goal [N m/A, or N m/V in pwm mode]
 chain        only for a spatial arm: its geometry, and the combination that each base parameter represents
 truth        only on a fake arm: the base parameters it was built with, for the true torque constants of its motors
-truth_scaled `truth` scaled to the torque constants in the file, like `parameters`; only if those of the motors differ
+truth_scaled `truth` scaled to the file's torque constants, like `parameters`; only if the motors' constants differ
 physical     masses, centres and inertias, if [known] gives any quantity
 stabiliser   with a stabiliser: its share of the torque
 steps        with a pilot: predicted and measured peaks of each step

@@ -1,4 +1,4 @@
-"""Run work that may block in a separate thread: files, terminals, callbacks.
+"""A separate thread for work that can block: writing to files and terminals, and callbacks.
 
 A terminal stopped with Ctrl-S or a file on a disconnected network drive can block a write indefinitely, and Python
 handles no signal in the meantime. Therefore the control loop only puts items into a bounded queue; items that do not

@@ -12,7 +12,7 @@ import numpy as np
 from hil.errors import RunFolderError
 
 MOST_ARCHIVE_BYTES = 512 * 2**20
-"""Largest total size of the arrays in a period.npz [bytes]: hours of samples at 4 kHz."""
+"""Largest total size of the arrays in a period.npz [bytes]: enough for hours of samples at 4 kHz."""
 
 MOST_CSV_BYTES = 1024 * 2**20
 
@@ -25,7 +25,7 @@ def check_archive(path: Path) -> None:
     BadZipFile.
     """
     with path.open("rb") as file:
-        # What precedes the archive ZipFile skips, but numpy takes the file for a pickle, and advises to load it.
+        # ZipFile skips data before the archive; numpy would take the file for a pickle and advise loading it.
         if file.read(2) != b"PK":
             raise BadZipFile("it does not begin like an .npz file")
     with ZipFile(path) as archive:

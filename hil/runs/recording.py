@@ -181,7 +181,7 @@ class Recorder:
         )
 
     def _touch(self, first: int) -> None:
-        """Map the pages of a chunk of rows for writing in advance: the first write to a page can take 0.4 ms."""
+        """Map the pages of a chunk of rows before they are needed: the first write to a page can take 0.4 ms."""
         size = self._row.size
         chunk = self._bytes[first * size : (first + self._rows_a_chunk) * size]
         if not chunk.nbytes:

@@ -1,6 +1,6 @@
 """The folder of an estimate from other tools' recordings: the data exactly as used, and the result.
 
-config.toml      the configuration: a copy of the one given, with [columns] as they were interpreted
+config.toml      the configuration: a copy of the one given, with [columns] as interpreted
 run.json         the files with their SHA-256, versions and machine, notes
 recordings.npz   each recording in SI units, with what the model predicts
 result.json, report.html

@@ -1,8 +1,8 @@
 """The run folder: an exact copy of the configuration, versions and machine, events, samples, result.
 
 config.toml     copied byte for byte
-experiment.json the [experiment] as run, if hil chose it (pilot, torque found by dry runs)
-stabiliser.json the [stabiliser] as used, if hil chose it
+experiment.json the [experiment] table as run, if hil chose it (pilot, torque found by dry runs)
+stabiliser.json the [stabiliser] table as used, if hil chose it
 run.json        versions, start time, and the data needed to interpret the samples
 servo_settings.json  the servos' settings before the run (hil.setup.session.servo_session)
 events.jsonl    events with their time, one JSON object per line, written as they happen
@@ -51,7 +51,7 @@ _PACKAGES = ("numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
 
 
 def taken(path: Path) -> RunFolderError:
-    """Return the error for a folder that is not empty; it suggests an unused one."""
+    """Return the error for a folder that is not empty; its message suggests an unused one."""
     free = next(found for number in count(2) if not (found := path.with_name(f"{path.name}-{number}")).exists())
     return RunFolderError(
         f"Run folder {path} is not empty; choose another (--out, or out= in Python), for example {free}, or remove it."
@@ -258,8 +258,8 @@ class RunFolder:
         return starts
 
     def write_played(self, played: Config) -> None:
-        """Save the [experiment] and [stabiliser] as used, if they differ from the file (pilot, computed torque or
-        gains), and the pose in which a spatial arm lay.
+        """Save the [experiment] and [stabiliser] tables actually used, if they differ from the file (pilot, computed
+        torque or gains), and the pose in which a spatial arm lay.
         """
         write_json(self.played_path, played.experiment.model_dump())
         if played.stabiliser is not None:
@@ -268,8 +268,8 @@ class RunFolder:
             write_json(self.rest_pose_path, {"rest_pose": list(played.arm.rest_pose)})
 
     def set_aside(self, name: str, played: Config) -> None:
-        """Move the recording of a run to the subfolder `name`, so that another run can use this folder. played: its
-        configuration.
+        """Move the recording of a run to the subfolder `name`, so that another run can use this folder. played: the
+        moved run's configuration.
         """
         folder = self.below(name, played)
         try:
@@ -373,7 +373,7 @@ def _has_samples(path: Path) -> bool:
 
 @cache
 def _versions() -> dict[str, str]:
-    """Return the versions of the packages that a result depends on; reading them takes as long as 100 exchanges."""
+    """Return the versions of the packages that a result depends on; reading them takes as long as 100 bus exchanges."""
     return {name: version(name) for name in _PACKAGES}
 
 

@@ -45,7 +45,7 @@ def lateness_histogram(samples: NDArray[np.void]) -> dict[str, list[float]]:
 
 
 def lost_samples(samples: NDArray[np.void], names: Sequence[str]) -> str:
-    """One sentence about the fraction of samples without a reply, by joint; "" if it is at most LOST_SHARE for each."""
+    """One sentence about the fraction of samples without a reply, by joint; "" if none exceeds LOST_SHARE."""
     if not len(samples):
         return ""
     sent = _round_trip(samples) > 0.0
@@ -70,7 +70,7 @@ def _sent(samples: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def _round_trip(samples: NDArray[np.void]) -> Array:
-    """From write to reply, in the shape of `samples` [s]; 0 where nothing was written."""
+    """Time from write to reply [s], in the shape of `samples`; 0 where nothing was written."""
     before: Array = samples["time_before_write"]
     after: Array = samples["time_after_read"]
     return after - before

@@ -105,7 +105,7 @@ def put(values: dict[str, Any], key: str, value: Scalar) -> None:
 
 
 class _NewList(list[Any]):
-    """A list that is not in the file and may therefore grow."""
+    """A list that is not in the file and can therefore grow."""
 
 
 def _inside(place: Any, part: str, after: str = "") -> Any:

@@ -52,7 +52,7 @@ class FleetArm:
 
 @dataclass(frozen=True)
 class Fleet:
-    """Comparison of the arms of one type. spreads, unlike (outliers, largest first): empty if there are too few."""
+    """Comparison of the arms of one type. spreads, unlike (outliers, largest first): empty for too few arms."""
 
     type: str
     arms: tuple[FleetArm, ...]
@@ -73,7 +73,7 @@ def fleets(table: pa.Table) -> list[Fleet]:
 def _fleet(kind: str, table: pa.Table) -> Fleet:
     """Compare arms of one type.
 
-    An arm's standard error is added to the fleet's spread: a poor recording is no outlier.
+    An arm's standard error is added to the fleet's spread, so that a poor recording does not make it an outlier.
     """
     recordings, trusts = _texts(table, "recording"), _texts(table, _TRUST)
     spreads, values, deviations = [], [], []

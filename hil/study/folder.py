@@ -71,7 +71,7 @@ def _discard(out: Path) -> None:
     """Remove the remains of a start that failed before its first row, so that they do not block the next one."""
     for name in ("study.toml", "about.json", ".lock"):
         (out / name).unlink(missing_ok=True)
-    with suppress(OSError):  # files of others are kept
+    with suppress(OSError):  # other files are kept
         (out / "rows").rmdir()
         out.rmdir()
 

@@ -94,8 +94,8 @@ class _Flight(Generic[Item, Result]):
 
     @property
     def room(self) -> int:
-        """How many more tasks may be in flight. Workers may join at any time; they get tasks once they have been
-        counted."""
+        """Number of further tasks that can be in flight. Workers can join at any time; they get tasks once they have
+        been counted."""
         if time.monotonic() - self._counted > _COUNTED_EVERY_S:
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
             self._window, self._counted = max(1, len(workers)) * (1 + _AHEAD), time.monotonic()

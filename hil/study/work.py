@@ -226,7 +226,7 @@ def _dry_run(arm: Path) -> Any:
 
 
 def _estimated(spec: Spec, folder: Path) -> Any:
-    """Estimate a copy of the recording, so that the fleet's own folders are not modified."""
+    """Estimate from a copy of the recording, so that the fleet's own folders are not modified."""
     from hil.estimation.settled_estimate import estimate_run
     from hil.runs.run_folder import RunFolder
 

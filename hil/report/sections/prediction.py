@@ -41,7 +41,7 @@ def _position(period: PlayedPeriod, joint: int, name: str, role: str, said: str)
 
 
 def _residual(data: RunData, joint: int, name: str) -> Picture:
-    assert data.fitted is not None  # the caller looked
+    assert data.fitted is not None  # checked by the caller
     left = data.fitted.error[joint] / abs(float(data.record.position_step[joint]))
     time = np.arange(len(left)) / data.fitted.rate
     series = [Series("measured minus predicted", time, left, BLUE, "dots")]

@@ -6,7 +6,7 @@ from hil.report.words import number
 
 
 def stabiliser(data: RunData) -> Section | None:
-    """The section; None if no stabiliser held the arm."""
+    """The section; None if no stabiliser was used."""
     share = data.result.stabiliser
     if share is None:
         return None
