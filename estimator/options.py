@@ -99,7 +99,7 @@ class CovarianceOptions:
 class LikelihoodOptions:
     """Options for stage 2, maximum likelihood estimation from settled periods.
 
-    Sums of squares are in units of the noise variance: 1 per sample is noise alone.
+    Sums of squares are in units of the noise variance: noise alone gives 1 per sample.
     """
 
     ftol: float = 1e-5
@@ -157,7 +157,7 @@ class LikelihoodOptions:
     """Maximum relative decrease of a Coulomb width per iteration with coarse steps, far from the minimum."""
 
     same_motion: float = 0.02
-    """Coarse steps may continue as long as their sum of squares differs from that with fine steps by less than this
+    """Coarse steps remain in use as long as their sum of squares differs from that with fine steps by less than this
     fraction.
     """
     same_cost: float = 1.0
@@ -188,8 +188,8 @@ class ShootingOptions:
     max_step: float = 1e-3
     """Longest integration step of the last fit [s]."""
     coarse_step: float = 2.6e-3
-    """Longest integration step of the earlier fits [s]: three times as fast, with errors of hundredths of a standard
-    error.
+    """Longest integration step of the earlier fits [s]: three times as fast as `max_step`, with errors of hundredths of
+    a standard error.
     """
     start_segments: int = 80
     """Maximum number of segments, evenly spread, in the fits that only need to come close to a minimum."""
@@ -209,7 +209,7 @@ class ShootingOptions:
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""
     reweightings: int = 2
-    """Number of refits, in which segments are downweighted by their residual in the previous fit."""
+    """Number of refits, in which segments are downweighted according to their residual in the previous fit."""
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ def _jump(position: Array) -> Array:
 
 
 def cut_off(lines: Lines) -> int:
-    """Return the highest harmonic with signal on any joint, judged by the mean power of bands of lines."""
+    """Return the highest harmonic with signal on any joint, determined from the mean power of bands of lines."""
     count = (lines.shape[1] - 1) // BAND
     power = np.abs(lines[:, 1 : 1 + count * BAND]) ** 2
     bands = power.reshape(lines.shape[0], count, BAND).mean(axis=2)

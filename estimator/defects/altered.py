@@ -146,7 +146,7 @@ class Altered:
         )
 
     def _without(self, hypothesis: Hypothesis, unknowns: Array) -> Array | None:
-        """Return parameters fitted to rescaled angles, or to the part that the defect hardly affects."""
+        """Return parameters fitted to rescaled angles, or to the part of the data that the defect hardly affects."""
         estimate, course = self.estimate, hypothesis.course
         factor = np.ones(estimate.model.joints)
         if hypothesis.kind == "scale":
@@ -271,7 +271,7 @@ class _Posed:
 
 
 def _with_every_friction(found: ShootingEstimate) -> ShootingEstimate:
-    """Return the estimate with all dry-friction terms, so that no defect imitates them; new ones have no effect."""
+    """Return the estimate with all dry-friction terms, so that no defect imitates them; a new load term is 0."""
     model = replace(found.model, friction=FRICTIONS[-1])
     values = {name: term_of(name).initial for name in model.names} | {
         f"load_{joint}": 0.0 for joint in range(1, model.joints + 1)

@@ -25,7 +25,7 @@ FEWEST_SEGMENTS = 6
 MOST_SEGMENTS = 400  # more would take too long
 EXPLAINED = 1.2  # mean square of the residual, relative to the noise
 FITTED = 3  # hypotheses, each of another kind or joint
-PROMISING = 0.45  # fraction of the residual beyond the noise: what explains less, in the score test or fitted, is left
+PROMISING = 0.45  # fraction of the residual beyond the noise: a hypothesis below it is dropped
 CERTAIN = 2.0  # decrease of the sum of squares relative to that expected by chance
 LEAST = {"scale": 0.01, "load": 0.02, "friction": 0.04, "torque": 0.01, "offset": 0.01, "arm": 0.03}
 """Smallest change that matters, as a fraction of the parameters; for an offset, as a fraction of the RMS torque."""

@@ -24,7 +24,7 @@ from hil.estimator.options import CovarianceOptions
 DEFAULTS = CovarianceOptions()
 FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates stay finite
 SENSITIVE = 1e7  # largest change of a sample, in units of the noise, per unit of a coordinate (RMS)
-LEAST_INFORMATION = 1e-13  # about a combination of coordinates, relative to each by itself, that is not rounding
+LEAST_INFORMATION = 1e-13  # about a combination of coordinates, relative to each alone; less is rounding error
 VANISHED = 1e-3  # slope relative to its value below which a parameter has run into its floor
 
 
@@ -160,8 +160,8 @@ def _measured(
 ) -> tuple[Mask, Array, Array, Array]:
     """Return two covariances from the data alone: one for independent errors, and a robust one.
 
-    The mask, returned first, selects the coordinates that they cover: those that influence the residual. Both are
-    relative to the scale, returned second.
+    The mask, returned first, selects the coordinates that they cover: those that influence the residual. Both
+    covariances are relative to the scale, returned second.
     """
     norm = np.sqrt(np.diag(at.normal))
     seen: Mask = norm > 1e-12 * norm.max()
@@ -180,8 +180,8 @@ def _measured(
 def _inverse(information: Array) -> Array:
     """Return the inverse of a matrix with diagonal elements of at most 1.
 
-    Coordinates that only matter together leave an eigenvalue that is zero except for rounding. A pseudoinverse would
-    treat their unknown difference as known exactly.
+    Coordinates of which only a combination matters leave an eigenvalue that is zero except for rounding. A
+    pseudoinverse would treat their unknown difference as known exactly.
     """
     size, directions = linalg.eigh(information)
     inverse: Array = (directions / np.maximum(size, LEAST_INFORMATION)) @ directions.T

@@ -147,13 +147,13 @@ class _Trials:
                 there = self._evaluated(moved)
                 if there.cost < self.at.cost:
                     return (moved, there), max(options.min_damping, taken * trusted)
-            # Also where `cost` promised a decrease that the normal equations' simulation does not confirm: damping
-            # rises from that of the step tried first, not of a less damped one, or the search would never end.
+            # This also applies if `cost` indicated a decrease that the normal equations' simulation does not confirm.
+            # Damping rises from that of the first step, not of a less damped one, or the search would never end.
             damping = max(10.0 * damping, options.initial_damping)
         return None, damping
 
     def _bolder(self, moved: Array, gained: float, damping: float, options: MinimiserOptions) -> tuple[Array, float]:
-        """Return the best point of successively less damped steps, and its damping."""
+        """Reduce the damping as long as the point improves; return the best point and its damping."""
         while damping > options.min_damping:
             less = max(options.min_damping, 0.1 * damping)
             further, _ = self._moved(less)

@@ -6,10 +6,10 @@ is compared with the largest and the smallest one since the joint came to rest: 
 offset cancel in these differences, and so do their errors. Only changes due to the motion of other joints have to be
 modelled.
 
-A torque outside the band accelerates a free joint. The joint counts as blocked once a free joint would show in the
-velocity register. Twice that momentum is required, because only half of the excess is certain to act on the joint: the
-position of the band is unknown. If a joint does move again, friction had been holding it: a torque that did not move it
-before never raises an alarm again.
+A torque outside the band accelerates a free joint. The joint counts as blocked once the motion of a free joint would
+show in the velocity register. Twice the momentum of that motion is required, because only half of the excess is certain
+to act on the joint: the position of the band is unknown. If a joint does move again, friction had been holding it: a
+torque that did not move it before never raises an alarm again.
 
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """

@@ -1,4 +1,4 @@
-"""Missing model terms, judged without fitting them: score tests, and the effect of omission on standard errors.
+"""Missing model terms, evaluated without fitting them: score tests, and the effect of omission on standard errors.
 
 Near an estimate the motion is linear in small changes of any parameter. One simulation with derivatives with respect to
 all of them yields the decrease of the sum of squares that each term would bring (C. R. Rao's score test, Proc.
@@ -241,7 +241,7 @@ def simulated_run(period: SettledPeriod) -> Run:
 
 
 def colour(residual: Array) -> float:
-    """Return the worst joint's integrated autocorrelation of a residual (joints, samples); 1 for white noise.
+    """Return the integrated autocorrelation of a residual (joints, samples) for the worst joint; 1 for white noise.
 
     Missing samples count as 0.
     """
@@ -255,7 +255,7 @@ def colour(residual: Array) -> float:
 
 
 def richer_models(model: Model) -> dict[str, Model]:
-    """Return the models with one more option or the next friction law, by the part that is added.
+    """Return the models with one more option or the next friction law, keyed by the part that is added.
 
     Presliding is left out, since the motion is not linear in its parameters.
     """

@@ -24,7 +24,7 @@ ITERATIONS = 3
 LEAST = 0.005  # minimum relative change of friction that matters
 MOST = 0.3  # maximum relative change of friction in one iteration
 SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step, tried until the prediction improves
-TELLS = 0.5  # part of what a change of friction leaves, below which a constant torque is the better explanation
+TELLS = 0.5  # fraction of the residual after a change of friction below which a constant torque explains it better
 NOTICED = 0.01  # constant torque, relative to the joint's RMS torque, below which it does not matter
 UNEVEN = 0.25  # relative part of a change that is not linear in time, or not the same for all friction
 SCALED = ("viscous", "coulomb", "load", "viscous_asymmetry")
@@ -107,7 +107,7 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
 
 @dataclass(frozen=True)
 class TorqueChange:
-    """Constant torque of each joint that acts in the later periods only."""
+    """Constant torque on each joint, acting in the later periods only."""
 
     change: Array
     """Torque (joints,) [N m]."""
@@ -116,7 +116,7 @@ class TorqueChange:
     left: float
     """Sum of squares of the residual that the torque does not explain, in units of the noise."""
     noticed: Array
-    """Smallest constant torque of each joint that matters (joints,) [N m]."""
+    """Smallest constant torque that matters, for each joint (joints,) [N m]."""
 
     @property
     def is_seen(self) -> Mask:

@@ -33,7 +33,7 @@ def wave_peaks(
     parameter name. If other terms have absorbed part of a wave, the best number may be wrong. Therefore other numbers
     are returned as well if they explain at least `COMPARABLE` times as much of the sum of squares as the best one.
 
-    only: joints to consider, from 1; by default all.
+    only: joints to consider, counted from 1; by default all.
     """
     used = without_spikes(period)
     run = simulated_run(used).integrated(COARSE)
@@ -69,7 +69,7 @@ def ranked_cycles(peaks: Mapping[str, Sequence[float]], most: int) -> list[dict[
 
 
 def without_height(wave: Wave, joints: Iterable[int]) -> dict[str, float]:
-    """Return zero amplitudes of a wave for `joints`, from 1, by parameter name."""
+    """Return zero amplitudes of a wave for `joints` (counted from 1), by parameter name."""
     return {f"{wave}_{part}_{joint}": 0.0 for part in ("sin", "cos") for joint in joints}
 
 

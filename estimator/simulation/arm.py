@@ -91,7 +91,7 @@ def simulate(
     vector = physics.vector.copy()
     pulls = np.zeros((2, samples if springs is not None else 0))
     if springs is not None:
-        # A spring is a cable, and an offset that changes from sample to sample.
+        # A spring is modelled as a cable plus an offset that changes from sample to sample.
         stiffness, ends = springs
         vector[CABLE : CABLE + joints] += stiffness
         pulls[:joints] = stiffness[:, None] * ends
@@ -118,8 +118,8 @@ def bump_at(ratio: float) -> float:
 
 
 def bend_at(v: float, sharp: float) -> tuple[float, float]:
-    """Return tanh(v sharp) and its derivative with respect to v, using one exponential: half the time of the library's
-    tanh.
+    """Return tanh(v sharp) and its derivative with respect to v, using one exponential, in half the time that the
+    library's tanh takes.
     """
     past = 2.0 * abs(v) * sharp
     if not past < FADED:

@@ -45,7 +45,7 @@ SHAPES = {
 }
 """Priors on the shape of friction and on drives: typical value [in its unit] and standard deviation of its logarithm.
 
-Early in a fit they are held fixed: a lag that is driven to zero while other errors dominate would hardly recover.
+Early in a fit, these parameters are held fixed: a lag driven to zero while other errors dominate would hardly recover.
 """
 ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
 """Priors on small angles that gravity may not reveal: standard deviations around zero [rad]."""

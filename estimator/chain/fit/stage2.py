@@ -89,7 +89,7 @@ class ChainFit:
 
     @property
     def reached(self) -> bool:
-        """Whether the fit has reached its minimum: another step would change it by less than a standard error."""
+        """Whether the fit has reached its minimum: another step would be shorter than one standard error."""
         return self.remaining <= DEFAULTS.unfinished
 
 

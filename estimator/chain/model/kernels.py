@@ -11,7 +11,7 @@ over the mass, it is
 so that twelve numbers per body replace its 36. The regressor is that of Atkeson, An and Hollerbach, International
 Journal of Robotics Research 5 (1986) 101, in link frames.
 
-Every formula is linear in the inertial parameters, so base parameters, with all others zero, may replace them.
+Every formula is linear in the inertial parameters, so base parameters, with all others zero, can be used instead.
 """
 
 import math
