@@ -5,8 +5,8 @@ motor torque; the parameters are constant except for a little process noise; eac
 Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with the Jacobian of the integrated step by finite
 differences. UKF: Julier and Uhlmann, Proc. IEEE 92 (2004) 401, symmetric sigma points.
 
-The filters are given every fair advantage: the same dynamics as the likelihood, an initial guess from filtered least
-squares with a realistic spread, several passes over the recording, and noise levels that a caller may tune.
+The filters are given every fair advantage: the likelihood's dynamics, an initial guess from filtered least squares with
+a realistic spread, several passes over the recording, and noise levels that a caller may tune.
 """
 
 from collections.abc import Callable

@@ -54,7 +54,7 @@ class ClockDrift:
     start: float
     end: float
     relative: float
-    """Change of the delay per unit of time: the relative difference between the clocks' rates."""
+    """Change in the delay per unit of time: the relative difference between the clocks' rates."""
     residual: float
     residual_given: float
 
@@ -89,7 +89,7 @@ class Uneven:
 
 
 def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
-    """Return the joints whose motion is explained much better by a limited torque."""
+    """Return the joints whose motion a limited torque explains much better than the torque as given."""
     given = _residuals(recordings)
     if given is None:
         return ()

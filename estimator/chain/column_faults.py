@@ -27,26 +27,26 @@ from hil.estimator.errors import EstimationError, RecordingError
 SUSPICIOUS = 0.1  # relative torque residual of the worst joint, below which only contradictory torques are sought
 CLEAR = 0.5  # largest ratio of the worst joint's residuals, with a change and as given
 WELL = 0.3  # largest relative residual with a change
-GAIN = 0.03  # decrease of the residual's logarithm, mean of the joints, that makes factors of the torques credible
+GAIN = 0.03  # decrease in the residual's logarithm, mean of the joints, that makes factors of the torques credible
 AS_WELL = 1.05  # ratio of the residuals up to which fewer reversals are preferred
 EQUALLY_FAR = 4.0  # difference of squared distances from the description that decides between two reversals
 SIGNIFICANT = 3.0  # standard errors
-FACTORS = np.exp(np.linspace(-np.log(6.0), np.log(6.0), 41))  # of a torque: those that are tried
+FACTORS = np.exp(np.linspace(-np.log(6.0), np.log(6.0), 41))  # torque factors that are tried
 STEPS = 1.0 + 0.08 * np.linspace(-1.0, 1.0, 17)  # by which the best factor is refined
 RIDGE = 1e-12  # added to normal equations of unit diagonal, so that a joint that hardly moves leaves them regular
 SWEEPS = 3  # over the joints
 DELAYS = 0.005 * np.arange(-12, 13)  # s: delays of the torques that are tried
 LEAST_LATE = 0.01  # s
 LATE = 0.6  # largest ratio of a joint's residuals, with a delay and as given
-ONE_LATE = 0.3  # decrease of the logarithms of residuals, beyond a common delay's, that makes one joint's credible
+ONE_LATE = 0.3  # decrease in the logarithms of residuals, beyond a common delay's, that makes one joint's credible
 TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 10.0])  # factors that are tried
 
 
 @dataclass(frozen=True)
 class Reversed:
     """Reversed columns. residuals: relative RMS of the worst joint's torque residual with the change, and as given.
-    impossible: whether friction is negative with the columns as given, as it is when all torques or a vertical first
-    joint are reversed.
+    impossible: whether friction is negative as given, since all torques or the columns of a vertical first joint are
+    reversed.
     """
 
     residuals: tuple[float, float]
@@ -171,7 +171,7 @@ class ColumnCheck:
         return Reversed((worst, given.worst), signs, impossible, *other)
 
     def swapped_columns(self) -> Swapped | None:
-        """The exchange of two joints' columns that explains the recordings much better."""
+        """The exchange of two joints' columns that explains the recordings much better than the columns as given."""
         torque, given, tried = self._rows[1], self._given[1].worst, []
         for pair in combinations(range(self.model.joints), 2):
             order = [*range(self.model.joints)]
@@ -189,7 +189,7 @@ class ColumnCheck:
         return Swapped((worst, given), pair, said) if worst < min(CLEAR * given, WELL) else None
 
     def late_torque(self) -> Late | None:
-        """The delay, of one joint's torque or of all torques, with which the recordings are explained better."""
+        """The delay of one joint's torque, or of all torques, that explains the recordings better than none."""
         (Y, torque), (normal, given) = self._rows, self._given
         every = {late: self._filtered(self.recordings, late)[1] for late in DELAYS.tolist()}
 
@@ -216,7 +216,7 @@ class ColumnCheck:
         return Late(residuals, chosen, late) if is_late and residuals[0] < LATE * residuals[1] else None
 
     def contradictory_torques(self) -> tuple[float, ...] | None:
-        """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better.
+        """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better than 1.
 
         The links' prior is weak and friction absorbs much of an error, so a small gain is evidence.
         """
@@ -235,7 +235,7 @@ class ColumnCheck:
         return tuple(factors.tolist())
 
     def wrong_times(self) -> WrongTimes | None:
-        """The time scale that explains the recordings much better, given gravity and the described geometry."""
+        """The time scale that explains the recordings much better than 1, given gravity and the described geometry."""
         given = self._given[1]
         if not np.any(self.model.base.chain.gravity):
             return None

@@ -53,7 +53,7 @@ def white_noise(position: Array, valid: Mask | None = None) -> Array:
     removed first, since the jump between the ends of a period would spread over all lines.
 
     valid: samples that were received (joints, samples); the others are interpolated linearly, and the result is
-    corrected for the effect of this on white noise.
+    corrected for the effect of interpolation on white noise.
     """
     noise = _upper_noise(without_jump(position))
     if valid is None or valid.all():

@@ -16,7 +16,7 @@ SLOWLY = 0.65  # least ratio of successive changes while friction warms up, whic
 ALIKE = (
     0.8  # least correlation of successive changes while friction warms up, which always changes in the same direction
 )
-MOST_PERIODS = 100  # more periods would not be useful advice
+MOST_PERIODS = 100  # more would not be useful advice
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ class Altered:
         return rows - Q @ (Q.T @ rows), every - Q @ (Q.T @ every)
 
     def direction(self, hypothesis: Hypothesis) -> Array:
-        """Change of the parameters `names` per unit of each unknown (names, unknowns), as in `Direction`."""
+        """Change in the parameters `names` per unit of each unknown (names, unknowns), as in `Direction`."""
         if hypothesis.kind == "scale":  # the origin of the angles is unknown
             zeros = [name for name in self.names if kind_of(name) == "zero"]
             return np.array([[float(name == zero) for zero in zeros] for name in self.names])
@@ -235,7 +235,7 @@ class _Posed:
         return value
 
     def _change(self, number: int, shared: Array) -> Array:
-        """Change of the parameters in a segment (names,), as in `Direction`."""
+        """Change in a segment's parameters (names,), as in `Direction`."""
         first = shared.size - self.unknowns
         change: Array = self._strength(number) * self._direction @ shared[first : first + self._direction.shape[1]]
         return change

@@ -18,7 +18,7 @@ from hil.estimator.models.terms import kind_of, term_of
 Kind = Literal["scale", "load", "friction", "torque", "offset", "arm"]
 CourseKind = Literal["always", "step", "linear", "decay", "recording"]
 Direction = Mapping[str, float]
-"""Change of each parameter per unit of an unknown, as a fraction of the parameter; for an offset, in N m."""
+"""Change in each parameter per unit of an unknown, as a fraction of the parameter; for an offset, in N m."""
 
 MOST_STEPS = 24  # instants at which a sudden change is tried
 EDGE = 2  # segments before and after a sudden change

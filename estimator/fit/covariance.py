@@ -7,7 +7,7 @@ over all windows of L samples, of the outer product of the window's score with i
 
 A model error is not only correlated: it repeats at every reversal, so averaging does not remove it, and the part that
 resembles the effect of a parameter leaves no residual at all. Therefore the non-white part of the residual widens the
-errors further: 1.4 standard deviations cover every change of the parameters that alters the motion (RMS) by no more
+errors further: 1.4 standard deviations cover every change in the parameters that alters the motion (RMS) by no more
 than that part (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
 """
 
@@ -23,7 +23,7 @@ from hil.estimator.options import CovarianceOptions
 
 DEFAULTS = CovarianceOptions()
 FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates stay finite
-SENSITIVE = 1e7  # largest change of a sample, in units of the noise, per unit of a coordinate (RMS)
+SENSITIVE = 1e7  # largest change in a sample, in units of the noise, per unit of a coordinate (RMS)
 LEAST_INFORMATION = 1e-13  # about a combination of coordinates, relative to each alone; less is rounding error
 VANISHED = 1e-3  # slope relative to its value below which a parameter has run into its floor
 
@@ -160,8 +160,8 @@ def _measured(
 ) -> tuple[Mask, Array, Array, Array]:
     """Return two covariances from the data alone: one for independent errors, and a robust one.
 
-    The mask, returned first, selects the coordinates that they cover: those that influence the residual. Both
-    covariances are relative to the scale, returned second.
+    The mask, returned first, selects the coordinates that they cover: those that influence the residual. Both are
+    relative to the scale, returned second.
     """
     norm = np.sqrt(np.diag(at.normal))
     seen: Mask = norm > 1e-12 * norm.max()

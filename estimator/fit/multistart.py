@@ -88,9 +88,7 @@ class Search:
         return self._undisguised(refined, replace(minimum, iterations=spent))
 
     def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
-        """Return the minimum with constant Stribeck rises turned into Coulomb friction, unless the result explains
-        less.
-        """
+        """Return the minimum with constant Stribeck rises replaced by Coulomb friction, unless it explains less."""
         if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
             return refined, minimum
         try:

@@ -175,7 +175,7 @@ def minimise_segmented(
         derivative: returns the residuals of a segment and their derivatives.
         shared: initial shared coordinates (shared,), of order 1.
         own: initial coordinates of each segment (segments, own), of order 1.
-        ftol: stop when the relative decrease of a step is below this.
+        ftol: stop when the relative decrease in one step is below this.
         options: limits of the iteration.
         expected: prior on the shared coordinates.
         move: returns the shared coordinates reached by a step from given ones.

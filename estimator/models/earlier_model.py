@@ -30,9 +30,7 @@ is not exact in the next one: in a fast swing, terms several times as large as t
 """
 
 IN_A_ROW = 2
-"""Number of successive lessons (updates of the model) with an unexplained mean residual torque after which it is
-reported.
-"""
+"""Number of successive lessons (model updates) with unexplained mean residual torque after which it is reported."""
 
 ELASTIC_RAD = 0.03
 """Distance after a reversal over which dry friction approaches its sliding value [rad]. Their difference can at first

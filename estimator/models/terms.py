@@ -115,7 +115,7 @@ class Term:
     friction.
     """
     max_step: float | None = None
-    """Maximum change of the term's coordinate (for positive terms, a logarithm) per iteration; None for the fit's
+    """Maximum change in the term's coordinate (for positive terms, a logarithm) per iteration; None for the fit's
     limit.
     """
     standstill: bool = False
@@ -358,7 +358,7 @@ def extra_names(
 ) -> tuple[str, ...]:
     """Return the names of the other parameters of a model with these `parts`; by default of all parts.
 
-    by_voltage: joints, counted from 1, that are driven by voltage; by default all.
+    by_voltage: joints (from 1) that are driven by voltage; by default all.
     """
     return tuple(
         name

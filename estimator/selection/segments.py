@@ -85,7 +85,7 @@ def held_out_errors(
 
     The initial state of a segment is estimated from its first third; the rest is predicted from the torque alone. The
     median is taken over segments, since the error can be huge if the arm tumbles. A prediction that diverges counts as
-    wrong by half a turn.
+    an error of half a turn.
     """
     problem = _posed(recordings, estimate, of)
     values, joints = estimate.parameters, estimate.model.joints

@@ -61,7 +61,7 @@ def choose(
             used.
         drive: drive model of all candidates.
         torque_scale: whether the ratio of the torque constants is always kept.
-        by_voltage: joints, counted from 1, that are driven by voltage.
+        by_voltage: joints (from 1) that are driven by voltage.
         lever: as for `hil.estimator.models.model.Model`.
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
         seconds: time from the middle of `periods` to that of `held_out` [s], if known.
@@ -114,7 +114,7 @@ class Selection:
 
     @property
     def drift(self) -> Drift | None:
-        """The change of friction for which the periods are corrected."""
+        """The change in friction for which the periods are corrected."""
         return self._fitting.drift
 
     def _begin(self, model: Model, near: Trial | None = None, *, coarse: bool = False) -> None:
@@ -161,9 +161,7 @@ class Selection:
         return self._undisguised(self._without_bristles(again))
 
     def _undisguised(self, best: Trial) -> Trial:
-        """Refit with narrow Coulomb steps where the apparent Stribeck rise may be nothing but an imitation of them;
-        keep the new fit if it explains more.
-        """
+        """Refit with narrow Coulomb steps where these could cause the apparent Stribeck rise; keep the better fit."""
         values = {} if best.estimate is None else undisguised(best.estimate)
         return self._better(self._try_or_none(best.model, best, values), best) or best if values else best
 
@@ -198,7 +196,7 @@ class Selection:
         return sorted(kinds.values(), key=self._left)
 
     def _steadied(self, trial: Trial | None) -> Trial | None:
-        """Correct the periods for a change of friction, if one is found and the motion is then explained equally well.
+        """Correct the periods for a change in friction, if one is found and the motion is then explained equally well.
 
         The change is estimated from the uncorrected recordings, so that a later call, with a better model, replaces or
         withdraws an earlier correction. Returns the fit of the corrected periods, or else `trial`.

@@ -68,11 +68,11 @@ class Evidence:
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""
     drift: Drift | None = None
-    """Change of friction while the arm moved."""
+    """Change in friction while the arm moved."""
     torque: TorqueChange | None = None
-    """Constant torque in the held-out motion, if it explains that motion better than a change of friction does."""
+    """Constant torque in the held-out motion, if it explains that motion better than a change in friction does."""
     disturbances: tuple[str, ...] = field(default=())
-    """Faults of the recording itself, as sentences; they explain the residual and any change of friction."""
+    """Faults of the recording itself, as sentences; they explain the residual and any change in friction."""
     doubts: tuple[str, ...] = field(default=())
     """Implausible or contradictory values, as sentences."""
     notes: tuple[str, ...] = field(default=())
@@ -154,7 +154,7 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence,
 
 
 def unexplained_motion(joint: int, left: float) -> str:
-    """Return the beginning of a sentence about a joint (counted from 0) whose residual is `left` times the noise."""
+    """Return the beginning of a sentence about a joint (from 0) whose residual is `left` times the noise."""
     if left <= MUCH_LEFT:
         return f"The motion of joint {joint + 1} is not fully explained"
     return f"Joint {joint + 1} moves in a way that the model cannot explain"
@@ -204,7 +204,7 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
 
 
 def _distorted(validation: Validation) -> tuple[str, ...]:
-    """Return sentences about the response on unexcited lines and about the part that the model does not explain."""
+    """Return sentences about the response on unexcited lines and the part of it that the model does not explain."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
         return (
@@ -258,7 +258,7 @@ def _pushed(torque: TorqueChange | None) -> tuple[str, ...]:
 
 
 def _reason(change: float, seconds: float) -> str:
-    """Return the possible cause of a change of friction, as the end of a sentence. Friction falls as a servo warms up;
+    """Return the possible cause of a change in friction, as the end of a sentence. Friction falls as a servo warms up;
     a rise always indicates a fault.
     """
     holds = "the identified values hold for the fitted periods"

@@ -16,7 +16,7 @@ from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS
 
-PULL = 0.03  # weight of a unit change of a coordinate, relative to one standard error of a base parameter
+PULL = 0.03  # weight of a unit change in a coordinate, relative to one standard error of a base parameter
 LEAST_MASS = 1e-4  # kg
 LEAST_SPREAD = 1e-3  # m: minimum radius of gyration, for links described as point masses
 STEP = 1e-4  # of the central differences, relative to a coordinate's typical step

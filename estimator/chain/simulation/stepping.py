@@ -81,7 +81,7 @@ def _direct(
     bent = (1.0 - bend * bend) / width
     level_v = -2.0 * coulomb * rise * bump * v / (fading * fading)
     bent_v = -2.0 * bend * bent / width
-    # The equation is ID - left + ghk slope = 0; each entry: the decrease of `left` plus ghk times the slope's increase.
+    # The equation is ID - left + ghk slope = 0; each entry: the decrease in `left` plus ghk times the slope's increase.
     by[j] = p[VISCOUS, j] + level_v * bend + level * bent + ghk * (level_v * bent + level * bent_v)
     shape = bend + ghk * bent
     row[at[VISCOUS, j]] = v + ghk
