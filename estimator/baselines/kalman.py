@@ -6,7 +6,7 @@ Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with the J
 differences. UKF: Julier and Uhlmann, Proc. IEEE 92 (2004) 401, symmetric sigma points.
 
 The filters are given every fair advantage: the likelihood's dynamics, an initial guess from filtered least squares with
-a realistic spread, several passes over the recording, and noise levels that a caller may tune.
+a realistic spread, several passes over the recording, and noise levels that a caller can tune.
 """
 
 from collections.abc import Callable

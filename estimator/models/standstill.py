@@ -34,7 +34,7 @@ HOLD_S = 0.03
 
 _SINGLES = 9
 # Scalars of a joint, before its two equations: angle at which it came to rest, whether an equation is stored, half of
-# the range that it withstood before it moved again, torque of the equations with the least and largest residual,
+# the range that it withstood before it moved again, torque of the equations with the lowest and highest residual,
 # largest range so far beyond the velocity's rounding, excess momentum to either side, and its duration.
 _ANGLE, _SEEN, _WITHSTOOD, _LEAST, _MOST, _RANGE, _UP, _DOWN, _LASTS = range(_SINGLES)
 
