@@ -100,7 +100,7 @@ def calibrate(
     Args:
         without: settled period of the arm without the mass.
         with_mass: settled period of the arm with the mass.
-        first: estimate from `without` with the assumed torque constants; its model is used for both periods.
+        first: estimate obtained from `without` with the assumed torque constants; its model is used for both periods.
         known: the mass.
         gravity: acceleration of gravity in the arm's plane [m/s^2].
         options: tolerances and limits.

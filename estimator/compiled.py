@@ -90,7 +90,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 def _used(function: FunctionType) -> Iterator[tuple[str, Any]]:
     """Yield the names and values of the package's globals and module attributes that the function may use.
 
-    Libraries are left out: numba's cache depends on its version, and it implements numpy's functions itself.
+    Libraries are left out: numba's cache depends on numba's version, and numba implements numpy's functions itself.
     """
     names = sorted({name for code in _codes(function.__code__) for name in code.co_names})
     for name in names:

@@ -1,6 +1,6 @@
 """Options of the fits: tolerances, limits and initial guesses, in one frozen object per fit.
 
-Names follow scipy.optimize: `ftol` is the relative decrease of the sum of squares below which a fit has converged,
+Names follow scipy.optimize: `ftol` is the relative decrease in the sum of squares below which a fit has converged,
 `max_iterations` the maximum number of iterations.
 """
 
@@ -23,7 +23,7 @@ class MinimiserOptions:
 
     max_iterations: int = 150
     max_step: float = 2.0
-    """Maximum change of a coordinate per iteration."""
+    """Maximum change in a coordinate per iteration."""
     unfinished: float = 1e-2
     """After `max_iterations`, a relative decrease below this still counts as converged."""
     initial_damping: float = 1e-3
@@ -38,7 +38,7 @@ class SegmentedMinimiserOptions:
 
     max_iterations: int = 80
     max_step: float = 2.0
-    """Maximum change of a coordinate per iteration."""
+    """Maximum change in a coordinate per iteration."""
     unfinished: float = 1e-3
     """After `max_iterations`, a relative decrease below this still counts as converged."""
     initial_damping: float = 1e-3
@@ -53,7 +53,7 @@ class CoordinateOptions:
     width_floor: float
     """Lower bound of the width of every smoothed Coulomb step [rad/s]."""
     widths_per_substep: float = 2.0
-    """Largest change of a joint's velocity that a reversal of friction may cause in the shortest substep, in widths of
+    """Largest change in a joint's velocity that a reversal of friction may cause in the shortest substep, in widths of
     the smoothed Coulomb step.
 
     Beyond about ten, the simulation jumps back and forth across the step: the motion hardly changes, but its
@@ -68,7 +68,7 @@ class CoordinateOptions:
     min_width: float = 1e-3
     """Minimum distance of a width from its lower bound, as a fraction of that bound, so that it can grow again."""
     max_relative_increase: float = 2.0
-    """Maximum relative increase of a width per iteration."""
+    """Maximum relative increase in a width per iteration."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class CovarianceOptions:
 class LikelihoodOptions:
     """Options for stage 2, maximum likelihood estimation from settled periods.
 
-    Sums of squares are in units of the noise variance: 1 per sample is noise alone.
+    Sums of squares are in units of the noise variance: noise alone gives 1 per sample.
     """
 
     ftol: float = 1e-5
@@ -125,7 +125,7 @@ class LikelihoodOptions:
     least_inflation: float = 2.0
     """Factor by which the data's variance must exceed that of independent errors for priors to gain weight."""
     least_tempering: float = 1e-4
-    """Minimum relative increase of the sum of squares for which the fit is repeated with the heavier priors."""
+    """Minimum relative increase in the sum of squares for which the fit is repeated with the heavier priors."""
 
     initial_widths: tuple[float, ...] = (0.005, 0.05)
     """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried."""
@@ -151,13 +151,13 @@ class LikelihoodOptions:
     """Minimum number of samples per unknown, over all joints; a shorter beginning is skipped."""
 
     max_relative_decrease: float = 0.8
-    """Maximum relative decrease of a Coulomb width per iteration with fine steps, where the cost is nearly quadratic.
+    """Maximum relative decrease in a Coulomb width per iteration with fine steps, where the cost is nearly quadratic.
     """
     max_relative_decrease_coarse: float = 0.5
-    """Maximum relative decrease of a Coulomb width per iteration with coarse steps, far from the minimum."""
+    """Maximum relative decrease in a Coulomb width per iteration with coarse steps, far from the minimum."""
 
     same_motion: float = 0.02
-    """Coarse steps may continue as long as their sum of squares differs from that with fine steps by less than this
+    """Coarse steps remain in use as long as their sum of squares differs from that with fine steps by less than this
     fraction.
     """
     same_cost: float = 1.0
@@ -188,8 +188,8 @@ class ShootingOptions:
     max_step: float = 1e-3
     """Longest integration step of the last fit [s]."""
     coarse_step: float = 2.6e-3
-    """Longest integration step of the earlier fits [s]: three times as fast, with errors of hundredths of a standard
-    error.
+    """Longest integration step of the earlier fits [s]: three times as fast as `max_step`, with errors of hundredths of
+    a standard error.
     """
     start_segments: int = 80
     """Maximum number of segments, evenly spread, in the fits that only need to come close to a minimum."""
@@ -209,7 +209,7 @@ class ShootingOptions:
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""
     reweightings: int = 2
-    """Number of refits, in which segments are downweighted by their residual in the previous fit."""
+    """Number of refits, in which segments are downweighted according to their residual in the previous fit."""
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ class SettlingOptions:
 
     max_periods: int = 50
     atol: float = 1e-7
-    """Largest change of the state from one period's end to the next that counts as periodic [rad and rad/s]."""
+    """Largest change in the state from one period's end to the next that counts as periodic [rad and rad/s]."""
     acceptable: float = 1e-5
     """Change that is accepted after `max_periods`; far below any encoder step [rad and rad/s]."""
 
@@ -252,7 +252,7 @@ class SelectionOptions:
     """RMS residual in units of the noise below which a richer model's minimum is searched for near the simpler one's.
     """
     steady_residual: float = 5.0
-    """RMS residual in units of the noise below which a change of friction is searched for, since a worse model may
+    """RMS residual in units of the noise below which a change in friction is searched for, since a worse model may
     imitate one.
     """
     presliding_residual: float = 1.2

@@ -9,7 +9,7 @@ Tell = Callable[[int, int], None]
 
 
 def counted(tell: Tell | None, total: int) -> Callable[[], None]:
-    """Return a function to be called after each of `total` steps, which reports the number of steps done to `tell`."""
+    """Return a function to call after each of `total` steps; it reports the number of steps done to `tell`."""
     done = 0
 
     def step() -> None:

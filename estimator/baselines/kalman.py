@@ -5,8 +5,8 @@ motor torque; the parameters are constant except for a little process noise; eac
 Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with the Jacobian of the integrated step by finite
 differences. UKF: Julier and Uhlmann, Proc. IEEE 92 (2004) 401, symmetric sigma points.
 
-The filters get every fair advantage: the likelihood's dynamics, an initial guess from filtered least squares with a
-realistic spread, several passes over the recording, and noise levels that a caller may tune.
+The filters are given every fair advantage: the likelihood's dynamics, an initial guess from filtered least squares with
+a realistic spread, several passes over the recording, and noise levels that a caller can tune.
 """
 
 from collections.abc import Callable
@@ -24,8 +24,8 @@ from hil.estimator.models.terms import base_names
 
 PASSES = 3
 LONGEST_STEP = 1.3e-3  # s
-SPREAD = 0.1  # initial standard deviation as a fraction of the parameter; the UKF's sigma points are four times as far
-LEAST_SPREAD = 0.02  # minimum of it, as a fraction of the largest parameter of the same kind
+SPREAD = 0.1  # initial standard deviation as a fraction of the parameter; the UKF's sigma points are 4 times as far out
+LEAST_SPREAD = 0.02  # its minimum, as a fraction of the largest parameter of the same kind
 DIFFERENCE = 1e-6
 # The twelve constants of the compiled arm; a one-joint arm uses five of them.
 SLOTS = CONSTANTS[:12]

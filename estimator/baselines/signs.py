@@ -121,7 +121,7 @@ class Absolute:
     """An angle of joint 2 that seems to be measured from a fixed direction instead of from link 1.
 
     residual, residual_given: relative RMS of the worst joint's torque residual, with the difference between the angles
-    and as given. turned: angle [rad] that must be added to this difference.
+    and with the angle as given. turned: angle [rad] that must be added to this difference.
     """
 
     residual: float
@@ -133,7 +133,7 @@ def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = 
     """Return evidence that joint 2's angle is absolute; None if that does not explain the recordings much better.
 
     turned: angles [rad] to try adding to the difference, in case the two angles were measured from different
-    directions; quarter turns are always tried. The first that explains the recordings as well as any is chosen.
+    directions; quarter turns are always tried. The first that explains the recordings as well as any other is chosen.
     """
     if recordings[0].joints != 2:
         return None
@@ -199,8 +199,8 @@ def suspect_order(recordings: Sequence[Recording], torques: bool = True) -> tupl
 
 
 def _better_explained(recordings: Sequence[Recording], changed: Sequence[Recording]) -> tuple[float, float] | None:
-    """Return the worst joint's relative RMS torque residual, first with the changed recordings, then with those given;
-    None if the change does not explain them much better.
+    """Return the worst joint's relative RMS torque residual, first with the changed recordings, then with the given
+    ones; None if the change does not explain them much better.
     """
     as_given = Signs((1, 1), (1, 1))
     given, fitted = _fit(recordings, as_given), _fit(changed, as_given)

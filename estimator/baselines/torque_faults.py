@@ -17,7 +17,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 
 BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
-"""Clipping levels to try, as fractions of the samples that exceed them."""
+"""Clipping levels to try, each given as the fraction of samples that exceed it."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
 LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
@@ -54,7 +54,7 @@ class ClockDrift:
     start: float
     end: float
     relative: float
-    """Change of the delay per unit of time: the relative difference between the clocks' rates."""
+    """Change in the delay per unit of time: the relative difference between the clocks' rates."""
     residual: float
     residual_given: float
 
@@ -89,7 +89,7 @@ class Uneven:
 
 
 def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
-    """Return the joints whose motion is explained much better by a limited torque."""
+    """Return the joints whose motion a limited torque explains much better than the torque as given."""
     given = _residuals(recordings)
     if given is None:
         return ()
@@ -136,7 +136,7 @@ def suspect_late(recordings: Sequence[Recording]) -> Late | None:
 
 
 def suspect_uneven(recordings: Sequence[Recording]) -> Uneven | None:
-    """Return the joints whose best delays differ, judging each joint by its own residual."""
+    """Return the joints whose best delays differ, each evaluated by its own residual."""
     joints = recordings[0].joints
     if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
         return None

@@ -1,4 +1,4 @@
-"""Zero angle of a recording's joints, estimated from gravity before any fit."""
+"""Zero angles of a recording's joints, estimated from gravity before any fit."""
 
 from collections.abc import Sequence
 from dataclasses import replace

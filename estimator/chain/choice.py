@@ -99,7 +99,7 @@ def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, 
 
 
 def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) -> float:
-    """Return the increase of twice the log likelihood beyond chance, with each joint's noise level unknown.
+    """Return the increase in twice the log likelihood beyond that expected by chance, with unknown noise levels.
 
     The residual's correlation is taken from the richer model, since what the simpler one omits is not noise.
     """

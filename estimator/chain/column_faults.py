@@ -1,8 +1,8 @@
 """Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, wrong times.
 
 As for planar arms (`hil.estimator.baselines.signs`), the torque residual of filtered inverse dynamics with a column
-changed is compared with that of the columns as given. Signs and factors of torques only change how the joints' normal
-equations are added up, so all combinations can be tried.
+changed is compared with the residual for the columns as given. Signs and factors of torques only change how the joints'
+normal equations are added up, so all combinations can be tried.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,32 +27,33 @@ from hil.estimator.errors import EstimationError, RecordingError
 SUSPICIOUS = 0.1  # relative torque residual of the worst joint, below which only contradictory torques are sought
 CLEAR = 0.5  # largest ratio of the worst joint's residuals, with a change and as given
 WELL = 0.3  # largest relative residual with a change
-GAIN = 0.03  # decrease of the residual's logarithm, mean of the joints, that makes factors of the torques credible
+GAIN = 0.03  # decrease in the residual's logarithm, mean of the joints, that makes factors of the torques credible
 AS_WELL = 1.05  # ratio of the residuals up to which fewer reversals are preferred
 EQUALLY_FAR = 4.0  # difference of squared distances from the description that decides between two reversals
 SIGNIFICANT = 3.0  # standard errors
-FACTORS = np.exp(np.linspace(-np.log(6.0), np.log(6.0), 41))  # of a torque, that are tried
+FACTORS = np.exp(np.linspace(-np.log(6.0), np.log(6.0), 41))  # torque factors that are tried
 STEPS = 1.0 + 0.08 * np.linspace(-1.0, 1.0, 17)  # by which the best factor is refined
 RIDGE = 1e-12  # added to normal equations of unit diagonal, so that a joint that hardly moves leaves them regular
 SWEEPS = 3  # over the joints
-DELAYS = 0.005 * np.arange(-12, 13)  # s, of the torques, that are tried
+DELAYS = 0.005 * np.arange(-12, 13)  # s: delays of the torques that are tried
 LEAST_LATE = 0.01  # s
 LATE = 0.6  # largest ratio of a joint's residuals, with a delay and as given
-ONE_LATE = 0.3  # decrease of the residuals' logarithms, beyond that by a common delay, that makes one joint's credible
+ONE_LATE = 0.3  # decrease in the logarithms of residuals, beyond a common delay's, that makes one joint's credible
 TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 10.0])  # factors that are tried
 
 
 @dataclass(frozen=True)
 class Reversed:
     """Reversed columns. residuals: relative RMS of the worst joint's torque residual with the change, and as given.
-    impossible: whether friction is negative as given, as when all torques or a vertical first joint are reversed.
+    impossible: whether friction is negative as given, since all torques or the columns of a vertical first joint are
+    reversed.
     """
 
     residuals: tuple[float, float]
     signs: Signs
     impossible: bool
     instead: Signs | None = None
-    """Another reversal of as many columns that explains the recordings equally well."""
+    """Another reversal, of the same number of columns, that explains the recordings equally well."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Swapped:
 
 @dataclass(frozen=True)
 class Late:
-    """Torque that is logged `seconds` later than it acted, or earlier if negative. residuals: of the joint's torque."""
+    """Torque logged `seconds` later than it acted; if negative, earlier. residuals: those of the joint's torque."""
 
     residuals: tuple[float, float]
     joint: int | None
@@ -144,7 +145,7 @@ class ColumnCheck:
 
     @property
     def suspicious(self) -> bool:
-        """Whether inverse dynamics leaves so much torque unexplained that a mistake is worth looking for."""
+        """Whether inverse dynamics leaves so much torque unexplained that a search for mistakes is worthwhile."""
         return self._given[1].worst > SUSPICIOUS or self._dissipates_too_little(self._given[1])
 
     def reversed_columns(self) -> Reversed | None:
@@ -170,7 +171,7 @@ class ColumnCheck:
         return Reversed((worst, given.worst), signs, impossible, *other)
 
     def swapped_columns(self) -> Swapped | None:
-        """The exchange of two joints' columns that explains the recordings much better."""
+        """The exchange of two joints' columns that explains the recordings much better than the columns as given."""
         torque, given, tried = self._rows[1], self._given[1].worst, []
         for pair in combinations(range(self.model.joints), 2):
             order = [*range(self.model.joints)]
@@ -188,7 +189,7 @@ class ColumnCheck:
         return Swapped((worst, given), pair, said) if worst < min(CLEAR * given, WELL) else None
 
     def late_torque(self) -> Late | None:
-        """The delay of one joint's torque, or of all, that explains the recordings better."""
+        """The delay of one joint's torque, or of all torques, that explains the recordings better than none."""
         (Y, torque), (normal, given) = self._rows, self._given
         every = {late: self._filtered(self.recordings, late)[1] for late in DELAYS.tolist()}
 
@@ -210,12 +211,12 @@ class ColumnCheck:
             residuals = (float(common.relative[worst]), float(given.relative[worst]))
         else:
             residuals, chosen = (float(found.relative[joint]), float(given.relative[joint])), joint
-        # Whether a torque is that of a sample or of the interval after it is not always known.
+        # It is not always known whether a torque belongs to a sample or to the interval after it.
         is_late = abs(late) > 0.99 * max(LEAST_LATE, *(each.interval for each in self.recordings))
         return Late(residuals, chosen, late) if is_late and residuals[0] < LATE * residuals[1] else None
 
     def contradictory_torques(self) -> tuple[float, ...] | None:
-        """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better.
+        """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better than 1.
 
         The links' prior is weak and friction absorbs much of an error, so a small gain is evidence.
         """
@@ -234,7 +235,7 @@ class ColumnCheck:
         return tuple(factors.tolist())
 
     def wrong_times(self) -> WrongTimes | None:
-        """The time scale that explains the recordings much better, given gravity and the described geometry."""
+        """The time scale that explains the recordings much better than 1, given gravity and the described geometry."""
         given = self._given[1]
         if not np.any(self.model.base.chain.gravity):
             return None
@@ -255,7 +256,7 @@ class ColumnCheck:
             return np.inf
 
     def _dissipates_too_little(self, found: _Solved) -> bool:
-        """Whether more friction terms are significantly negative than positive, or all those of a joint are."""
+        """Whether more friction terms are significantly negative than positive, or all of one joint are negative."""
         start, joints = self.model.base.count, self.model.joints
         over = (found.value / found.std)[start : start + 2 * joints].reshape(2, joints)
         negative = over < -SIGNIFICANT
@@ -266,7 +267,8 @@ class ColumnCheck:
 class _Normal:
     """Normal equations of each joint's torques.
 
-    squares: (joints, names, names). products: (joints, names), with the torque. torque: (joints,) its mean square.
+    squares: (joints, names, names). products: those with the torque (joints, names). torque: mean square of the torque
+    (joints,).
     """
 
     squares: Array
@@ -282,7 +284,7 @@ class _Normal:
         return cls(squares, *_driven(columns, torque), rows)
 
     def driven_by(self, columns: Array, torque: Array) -> "_Normal":
-        """The equations with other torques; `columns`: as for `of`."""
+        """Return the equations for other torques; `columns`: as for `of`."""
         return _Normal(self.squares, *_driven(columns, torque), self.rows)
 
     def solved(self, factors: Array, prior: Prior) -> _Solved:
@@ -310,7 +312,7 @@ def _driven(columns: Array, torque: Array) -> tuple[Array, Array]:
 
 
 def _turned(joints: int) -> Iterator[tuple[int, ...]]:
-    """Yield the signs of the angles to try: as given, one joint's reversed, all reversed."""
+    """Yield the angle signs to try: as given, one joint's reversed, all reversed."""
     yield (1,) * joints
     for joint in range(joints):
         yield tuple(-1 if each == joint else 1 for each in range(joints))

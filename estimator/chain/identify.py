@@ -70,7 +70,7 @@ class ChainEstimate(FittedParameters):
     unseen: tuple[str, ...]
     """Encoder zero errors and base tilts that the data barely constrain, which are therefore taken as zero."""
     doubtful_zeros: tuple[tuple[int, float], ...]
-    """Joints, from 1, whose encoder zeros the model holds fixed although the recording contradicts them, each with its
+    """Joints (from 1) whose encoder zeros the model holds fixed although the recording contradicts them, each with its
     zero error (true minus measured angle) [rad]. Empty if not tested.
     """
     noise_steps: Array
@@ -152,7 +152,7 @@ def identify_chain(
 
 
 def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int, float], ...]:
-    """Return the joints, from 1, whose fixed zeros are significantly wrong, by over LARGE_ZERO, and their errors.
+    """Return the joints (from 1) whose fixed zeros are wrong significantly and by over LARGE_ZERO, and their errors.
 
     A model error that widens the standard errors by the factor `systematic` can mimic zero errors, so it raises the
     threshold.

@@ -41,7 +41,7 @@ class MotionPiece(SettledPeriod):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "valid", np.isfinite(self.position))
-        assert self.position_std is not None  # `of` gives it
+        assert self.position_std is not None  # set by `of`
         object.__setattr__(self, "noise", self.position_std)
 
     @classmethod

@@ -53,7 +53,7 @@ def white_noise(position: Array, valid: Mask | None = None) -> Array:
     removed first, since the jump between the ends of a period would spread over all lines.
 
     valid: samples that were received (joints, samples); the others are interpolated linearly, and the result is
-    corrected for the effect of this on white noise.
+    corrected for the effect of interpolation on white noise.
     """
     noise = _upper_noise(without_jump(position))
     if valid is None or valid.all():
@@ -114,7 +114,7 @@ def _jump(position: Array) -> Array:
 
 
 def cut_off(lines: Lines) -> int:
-    """Return the highest harmonic with signal on any joint, judged by the mean power of bands of lines."""
+    """Return the highest harmonic with signal on any joint, determined from the mean power of bands of lines."""
     count = (lines.shape[1] - 1) // BAND
     power = np.abs(lines[:, 1 : 1 + count * BAND]) ** 2
     bands = power.reshape(lines.shape[0], count, BAND).mean(axis=2)

@@ -12,11 +12,11 @@ from hil.estimator.errors import ShapeError
 
 EVEN = 1.1  # maximum ratio of successive changes in a decreasing sequence
 SLOWEST = 0.97  # largest mean ratio of successive changes that still counts as decreasing
-SLOWLY = 0.65  # least ratio of successive changes while friction warms up, which takes many periods
+SLOWLY = 0.65  # minimum ratio of successive changes while friction warms up, which takes many periods
 ALIKE = (
-    0.8  # least correlation of successive changes while friction warms up, which always changes in the same direction
+    0.8  # minimum correlation of successive changes while friction warms up, as it always changes in the same direction
 )
-MOST_PERIODS = 100  # more are no advice
+MOST_PERIODS = 100  # more would not be useful advice
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ MOST_TORQUE = 1e4  # N m
 
 @dataclass(frozen=True)
 class Recording:
-    """Torque and position of an arm in arbitrary motion: ramps, swing-ups, recordings by other tools.
+    """Torque and position of an arm in arbitrary motion: ramps, swing-ups, recordings from other tools.
 
     Missing positions are NaN. Raises ShapeError for incompatible arrays; RecordingError for times that do not increase,
     non-finite values, gaps, and values that are implausible in SI units; StandstillError for a joint that moved by only
@@ -208,7 +208,7 @@ def _check_motion(recording: Recording) -> None:
         step = np.abs(np.diff(row))
         speed = step / np.diff(recording.time)
         k = int(np.argmax(speed))
-        is_turn = abs(step[k] - 2.0 * np.pi) < 0.5  # even if it is taken back: the angle wraps
+        is_turn = abs(step[k] - 2.0 * np.pi) < 0.5  # even if a turn back follows: the angle wraps
         # In a wrong unit, any small movement may look like an outlier.
         if speed[k] > MOST_SPEED and not is_turn and (step[k] > MOST_ANGLE or swing <= MOST_ANGLE):
             for at in {k, k + 1} - {0, row.size - 1}:

@@ -29,7 +29,7 @@ __all__ = ["agreed_noise", "coloured_noise", "repeated_noise"]
 FEWEST = 20  # samples of a pass; at 20 Hz, half a period of 2 s
 ROUNDING = 1.0 / 12.0  # steps^2
 AGREE = 2.0  # standard errors
-_LINES = 8.0  # samples of a period per line that its noise is measured by
+_LINES = 8.0  # samples of a period per line from which its noise is measured
 _LINE_ERROR = 0.72  # relative standard error of the noise from the median power of one line
 _STD = np.linspace(0.0, 1.0, 401)
 _ORDERS = np.arange(1, 30)
@@ -38,7 +38,7 @@ _HEIGHTS *= ROUNDING / _HEIGHTS.sum()  # the series is truncated
 _REPEATS = _HEIGHTS * np.exp(-((2.0 * np.pi * _ORDERS * _STD[:, None]) ** 2))
 """Repeating power of each order of the rounding error, for each of `_STD`, without drift (stds, orders) [steps^2]."""
 _SLOW = 1.0 / 16.0  # fraction of the lines that drift may occupy
-_CHANGE = 0.03  # largest relative change of the motion from pass to pass
+_CHANGE = 0.03  # largest relative change in the motion from pass to pass
 _SURE = 3.0  # standard errors by which coloured noise must exceed white noise
 _OCTAVE = 4.0  # largest ratio of the powers of noise in successive octaves: that of a first-order filter
 _MOST_NOISE = 1.0  # exponent of the correction for noise in the drift; above it, an order counts as decorrelated
@@ -80,7 +80,7 @@ def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
         return None
     found = [[_excess(*joint) for joint in zip(*each, strict=True)] for each in pairwise(passes)]
     excess, fast = 0.5 * np.mean(found, axis=0).T
-    # Most of the rounding error may repeat, so that small changes of the motion stand out against what is left of it.
+    # Most of the rounding error may repeat, so that small changes in the motion stand out against what is left of it.
     known = np.maximum(fast, ROUNDING * step**2)
     error = known * np.sqrt(2.0 * (0.75 + 0.75**2 / 0.25) / passes[0].shape[1])
     noise: Array = np.sqrt(np.where(excess > _SURE * error, excess / averaged, 0.0))

@@ -131,7 +131,7 @@ def _lagging(torque: Array, step: float, lag: float) -> Array:
 
 def grid_torque_slopes(recording: Recording, grid: Grid, delays: Array, lags: Array) -> Array:
     """Differentiate `grid_torque` with respect to each joint's delay and lag (2, joints, steps) [N m/s], by central
-    differences. Without a lag, both are the same, as for a tiny lag.
+    differences. Without a lag, the two derivatives are equal, as for a tiny lag.
     """
 
     def by(delay: Array | float, lag: Array | float) -> Array:

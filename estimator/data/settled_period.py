@@ -62,7 +62,7 @@ class SettledPeriod:
     Without it, a simulated arm may diverge from the real one.
     """
     before: Array | None = None
-    """Angles and velocities one period before the first sample (2, joints) [rad, rad/s], as read by the encoders.
+    """Angles and velocities one period before the first sample (2, joints) [rad, rad/s], from encoder readings.
 
     A motion counts as settled if it differs little from the previous period's; the rest of the transient can be
     predicted from this state.

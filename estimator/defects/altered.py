@@ -85,7 +85,7 @@ class Altered:
         return rows - Q @ (Q.T @ rows), every - Q @ (Q.T @ every)
 
     def direction(self, hypothesis: Hypothesis) -> Array:
-        """Change of the parameters `names` per unit of each unknown (names, unknowns), as in `Direction`."""
+        """Change in the parameters `names` per unit of each unknown (names, unknowns), as in `Direction`."""
         if hypothesis.kind == "scale":  # the origin of the angles is unknown
             zeros = [name for name in self.names if kind_of(name) == "zero"]
             return np.array([[float(name == zero) for zero in zeros] for name in self.names])
@@ -146,7 +146,7 @@ class Altered:
         )
 
     def _without(self, hypothesis: Hypothesis, unknowns: Array) -> Array | None:
-        """Return parameters fitted to rescaled angles, or to the part that the defect hardly affects."""
+        """Return parameters fitted to rescaled angles, or to the part of the data that the defect hardly affects."""
         estimate, course = self.estimate, hypothesis.course
         factor = np.ones(estimate.model.joints)
         if hypothesis.kind == "scale":
@@ -235,7 +235,7 @@ class _Posed:
         return value
 
     def _change(self, number: int, shared: Array) -> Array:
-        """Change of the parameters in a segment (names,), as in `Direction`."""
+        """Change in a segment's parameters (names,), as in `Direction`."""
         first = shared.size - self.unknowns
         change: Array = self._strength(number) * self._direction @ shared[first : first + self._direction.shape[1]]
         return change
@@ -271,7 +271,7 @@ class _Posed:
 
 
 def _with_every_friction(found: ShootingEstimate) -> ShootingEstimate:
-    """Return the estimate with all dry-friction terms, so that no defect imitates them; new ones have no effect."""
+    """Return the estimate with all dry-friction terms, so that no defect imitates them; a new load term is 0."""
     model = replace(found.model, friction=FRICTIONS[-1])
     values = {name: term_of(name).initial for name in model.names} | {
         f"load_{joint}": 0.0 for joint in range(1, model.joints + 1)

@@ -18,7 +18,7 @@ from hil.estimator.models.terms import kind_of, term_of
 Kind = Literal["scale", "load", "friction", "torque", "offset", "arm"]
 CourseKind = Literal["always", "step", "linear", "decay", "recording"]
 Direction = Mapping[str, float]
-"""Change of each parameter per unit of an unknown, as a fraction of the parameter; for an offset, in N m."""
+"""Change in each parameter per unit of an unknown, as a fraction of the parameter; for an offset, in N m."""
 
 MOST_STEPS = 24  # instants at which a sudden change is tried
 EDGE = 2  # segments before and after a sudden change
@@ -116,7 +116,7 @@ def _load(joints: int) -> tuple[Direction, ...]:
 
 
 def _torque_gain(joint: int, values: Mapping[str, float]) -> Direction:
-    """Return the effect of a true torque above that in the column; for joint 1, all other values appear smaller."""
+    """Return the effect of a true torque larger than the column's; for joint 1, all other values appear smaller."""
     if joint > 1:
         return {"torque_scale_2": 1.0}
     less = [name for name in values if term_of(name).unit in TORQUE_UNITS or name == "torque_scale_2"]

@@ -1,7 +1,7 @@
 """Search for the most probable defect of recordings: score tests of many, then fits of the best few.
 
 If friction, load or torque changed, or angles have a wrong scale, additional unknowns explain part of the residual. One
-simulation with all derivatives gives the decrease of the sum of squares for each of them (a score test, as in
+simulation with all derivatives gives the decrease in the sum of squares for each of them (a score test, as in
 `hil.estimator.selection.candidates`; for changes in time, following Nyblom, J. American Statistical Association 84
 (1989) 223).
 """
@@ -25,8 +25,8 @@ FEWEST_SEGMENTS = 6
 MOST_SEGMENTS = 400  # more would take too long
 EXPLAINED = 1.2  # mean square of the residual, relative to the noise
 FITTED = 3  # hypotheses, each of another kind or joint
-PROMISING = 0.45  # fraction of the residual beyond the noise: what explains less, in the score test or fitted, is left
-CERTAIN = 2.0  # decrease of the sum of squares relative to that expected by chance
+PROMISING = 0.45  # fraction of the residual beyond the noise: a hypothesis below it is dropped
+CERTAIN = 2.0  # decrease in the sum of squares relative to that expected by chance
 LEAST = {"scale": 0.01, "load": 0.02, "friction": 0.04, "torque": 0.01, "offset": 0.01, "arm": 0.03}
 """Smallest change that matters, as a fraction of the parameters; for an offset, as a fraction of the RMS torque."""
 
@@ -185,7 +185,7 @@ class _Linear:
         return _Score(hypothesis, max(left - fall, 0.0) / samples, explained, fall / max(float(chance), 1e-300))
 
     def _fall(self, base: Array, added: Array | None, hypothesis: Hypothesis) -> float:
-        """Return the decrease of the sum of squares if the unknowns `base` and `added` are freed."""
+        """Return the decrease in the sum of squares if the unknowns `base` and `added` are freed."""
         used = np.where(hypothesis.used, 1.0, 0.0)
         parts = [(base, used)] if added is None else [(base, used), (added, used * hypothesis.strength)]
         blocks = [[a.T @ np.einsum("s,sij->ij", p * q, self.normal) @ b for b, q in parts] for a, p in parts]

@@ -2,8 +2,8 @@
 
 The crest factor is lowered by minimising the L2p norm with increasing p: Guillaume, Schoukens, Pintelon, Kollar,
 "Crest-factor minimization using nonlinear Chebyshev approximation methods", IEEE Trans. IM 40 (1991) 982. The authors
-use Gauss-Newton steps, whose cost is lines^2 x samples. Here wave and gradient take one FFT each and the steps are
-L-BFGS, which also reaches lower peaks (1.40 instead of 1.44 for 25 lines).
+use Gauss-Newton steps, whose cost is lines^2 x samples. Here, the wave and its gradient take one FFT each, and the
+steps are those of L-BFGS, which also reaches lower peaks (1.40 instead of 1.44 for 25 lines).
 """
 
 import math

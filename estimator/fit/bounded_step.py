@@ -24,7 +24,7 @@ def bounded_step(matrix: Array, slope: Array, least: Array, most: Array) -> Arra
         matrix: M, positive definite (coordinates, coordinates).
         slope: g (coordinates,).
         least: lower bounds (coordinates,), at most 0.
-        most: upper bounds (coordinates,), at least 0; a coordinate with both 0 is fixed.
+        most: upper bounds (coordinates,), at least 0; a coordinate whose bounds are both 0 is fixed.
     """
     step = np.asarray(-linalg.solve(matrix, slope), dtype=np.float64)
     if np.all((step >= least) & (step <= most)):

@@ -7,7 +7,7 @@ over all windows of L samples, of the outer product of the window's score with i
 
 A model error is not only correlated: it repeats at every reversal, so averaging does not remove it, and the part that
 resembles the effect of a parameter leaves no residual at all. Therefore the non-white part of the residual widens the
-errors further: 1.4 standard deviations cover every change of the parameters that alters the motion (RMS) by no more
+errors further: 1.4 standard deviations cover every change in the parameters that alters the motion (RMS) by no more
 than that part (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
 """
 
@@ -23,8 +23,8 @@ from hil.estimator.options import CovarianceOptions
 
 DEFAULTS = CovarianceOptions()
 FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates stay finite
-SENSITIVE = 1e7  # largest change of a sample, in units of the noise, per unit of a coordinate (RMS)
-LEAST_INFORMATION = 1e-13  # about a combination of coordinates, relative to each by itself, that is not rounding
+SENSITIVE = 1e7  # largest change in a sample, in units of the noise, per unit of a coordinate (RMS)
+LEAST_INFORMATION = 1e-13  # about a combination of coordinates, relative to each alone; less is rounding error
 VANISHED = 1e-3  # slope relative to its value below which a parameter has run into its floor
 
 
@@ -180,8 +180,8 @@ def _measured(
 def _inverse(information: Array) -> Array:
     """Return the inverse of a matrix with diagonal elements of at most 1.
 
-    Coordinates that only matter together leave an eigenvalue that is zero except for rounding. A pseudoinverse would
-    treat their unknown difference as known exactly.
+    Coordinates of which only a combination matters leave an eigenvalue that is zero except for rounding. A
+    pseudoinverse would treat their unknown difference as known exactly.
     """
     size, directions = linalg.eigh(information)
     inverse: Array = (directions / np.maximum(size, LEAST_INFORMATION)) @ directions.T

@@ -69,7 +69,7 @@ def minimise(
     Args:
         evaluate: returns the sum of squares at a point; a non-finite sum counts as too large.
         start: initial coordinates (coordinates,).
-        ftol: stop when the actual or predicted relative decrease of a step is below this.
+        ftol: stop when the actual or predicted relative decrease in one step is below this.
         damping: initial damping; by default `options.initial_damping`.
         at: the sum of squares at `start`, if known.
         cost: returns the sum of squares alone, the same as `evaluate` except for rounding; by default `evaluate` is
@@ -147,13 +147,13 @@ class _Trials:
                 there = self._evaluated(moved)
                 if there.cost < self.at.cost:
                     return (moved, there), max(options.min_damping, taken * trusted)
-            # Also where `cost` promised a decrease that the normal equations' simulation does not confirm: damping
-            # rises from that of the step tried first, not of a less damped one, or the search would never end.
+            # Also if `cost` indicated a decrease that the normal equations' simulation does not confirm.
+            # Damping rises from that of the first step, not of a less damped one, or the search would never end.
             damping = max(10.0 * damping, options.initial_damping)
         return None, damping
 
     def _bolder(self, moved: Array, gained: float, damping: float, options: MinimiserOptions) -> tuple[Array, float]:
-        """Return the best point of successively less damped steps, and its damping."""
+        """Reduce the damping as long as the point improves; return the best point and its damping."""
         while damping > options.min_damping:
             less = max(options.min_damping, 0.1 * damping)
             further, _ = self._moved(less)
@@ -164,7 +164,7 @@ class _Trials:
         return moved, damping
 
     def _moved(self, damping: float) -> tuple[Array, float]:
-        """Return the end of a damped step, and the decrease of the sum of squares that the normal equations predict."""
+        """Return the end of a damped step, and the decrease in the sum of squares that the normal equations predict."""
         step = _step(self.at.normal, self.at.gradient, damping, *self.limits)
         return self.move(self.x, step), -float(step @ (2.0 * self.at.gradient + self.at.normal @ step))
 

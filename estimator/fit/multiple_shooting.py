@@ -36,7 +36,7 @@ DEFAULTS = ShootingOptions()
 ALL = slice(None)
 MOST_WEIGHT = 1e9
 ENOUGH = 1.25  # samples of a short segment at a low rate, relative to FEWEST
-MOST_SHORT = 0.6  # of a segment: short ones that had to be longer are not tried
+MOST_SHORT = 0.6  # of a segment: short ones that would have to be longer are not tried
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Shooting:
         names, options = self._model.names, self._options
         scales = scales_of(names, Sizes(*self._scales, max(base["inertia_1"], 1e-6)))
         resolved = resolved_widths(names, base, options.max_step, options.coordinates.widths_per_substep)
-        # The regression may make a joint much too light, and its step must not stay wide for good.
+        # The regression may make a joint much too light, but its Coulomb step must not stay wide.
         return Coordinates(names, scales, options.coordinates, np.minimum(resolved, options.initial_width))
 
     def position(self, segment: RecordingSegment, physics: Physics, state: Array) -> Array:

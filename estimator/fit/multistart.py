@@ -54,7 +54,7 @@ class Search:
 
     periods: Sequence[SettledPeriod]
     fine: Objective
-    """The objective with the (fine) integration steps of the result."""
+    """The objective with the fine integration steps used for the result."""
     rough: Objective
     """The objective with coarse integration steps."""
     options: LikelihoodOptions
@@ -88,7 +88,7 @@ class Search:
         return self._undisguised(refined, replace(minimum, iterations=spent))
 
     def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
-        """Return the minimum with constant Stribeck rises turned into Coulomb friction, unless that explains less."""
+        """Return the minimum with constant Stribeck rises replaced by Coulomb friction, unless it explains less."""
         if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
             return refined, minimum
         try:
@@ -156,9 +156,9 @@ class Search:
     def _refine(self, starts: Sequence[Start], wide: Array) -> Refined:
         """Refine the best of `starts`, and variants with different friction near standstill, using fine steps.
 
-        A fit that explains the motion may still have the wrong friction there. The tracking fit determines it well, and
-        fits do not get from a narrow step to a wide one, so the friction of the tracking fit and that of `wide`
-        (coordinates) are both tried.
+        A fit that explains the motion may still have the wrong friction near standstill. The tracking fit determines it
+        well, and fits do not progress from a narrow step to a wide one, so the friction of the tracking fit and that of
+        `wide` (coordinates) are both tried.
         """
         options = self.options
         ftol = options.ftol_coarse if self.coarse else options.ftol_start

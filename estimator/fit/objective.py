@@ -35,7 +35,7 @@ class Objective:
     """Prior of the parameters."""
     minimiser: MinimiserOptions
     max_relative_decrease: float
-    """Maximum relative decrease of the width of a smoothed Coulomb step per iteration."""
+    """Maximum relative decrease in the width of a smoothed Coulomb step per iteration."""
     horizon: float = 1.0
     """Fraction of each run, from its beginning, that is used."""
     tracking_stiffness: Array | None = None

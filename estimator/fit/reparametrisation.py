@@ -75,7 +75,8 @@ class Coordinates:
     def moved_in_proportion(self, x: Array, step: Array) -> Array:
         """Return the point that `step` (coordinates,) reaches from `x`; both arrays may end with other coordinates.
 
-        Base parameters themselves change in proportion: valleys of undetermined sums of inertias are straight in these.
+        Base parameters change linearly with the step, not exponentially: valleys along which only a sum of inertias is
+        determined are then straight.
         """
         y, count = x + step, len(self.names)
         for index, term in enumerate(map(term_of, self.names)):
@@ -91,8 +92,8 @@ class Coordinates:
     def limit(self, x: Array, least: Array, most: Array, max_relative_decrease: float) -> None:
         """Tighten, in place, the bounds on the change of each coordinate in one step from `x` (coordinates,).
 
-        A width is limited relative to itself, other parameters by their `Term.max_step`. From its floor, on which the
-        motion hardly depends, no later step would increase it again.
+        A width is limited relative to itself, other parameters by their `Term.max_step`. If a width reached its floor,
+        on which the motion hardly depends, no later step would increase it again.
         """
         least[: x.size] = np.maximum(least[: x.size], -self._longest)
         most[: x.size] = np.minimum(most[: x.size], self._longest)
@@ -108,8 +109,8 @@ class Coordinates:
     def undisguised(self, x: Array) -> Array:
         """Return `x` with constant Stribeck rises turned into Coulomb friction; `x` may end with other coordinates.
 
-        Where the Stribeck velocity is beyond all speeds of the motion, only the sum of rise and Coulomb friction is
-        determined, and a fit that has drifted there rarely returns to lower Stribeck velocities.
+        If the Stribeck velocity exceeds all speeds of the motion, only the sum of rise and Coulomb friction is
+        determined, and a fit that has drifted so far rarely returns to lower Stribeck velocities.
         """
         changed = x.copy()
         for index, name in enumerate(self.names):

@@ -85,7 +85,7 @@ class Segmented:
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.
-        own: number of coordinates, the last ones, that each belong to a single recording.
+        own: number of coordinates, at the end, that each belong to a single recording.
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
@@ -175,10 +175,10 @@ def minimise_segmented(
         derivative: returns the residuals of a segment and their derivatives.
         shared: initial shared coordinates (shared,), of order 1.
         own: initial coordinates of each segment (segments, own), of order 1.
-        ftol: stop when the relative decrease of a step is below this.
+        ftol: stop when the relative decrease in one step is below this.
         options: limits of the iteration.
         expected: prior on the shared coordinates.
-        move: returns the shared coordinates that a step from others reaches.
+        move: returns the shared coordinates reached by a step from given ones.
 
     Raises:
         ConvergenceError: if the simulation diverges, or if the relative decrease still exceeds `options.unfinished`

@@ -124,7 +124,8 @@ def worst_first(found: Sequence[Conflict | None]) -> tuple[Conflict, ...]:
 
 
 def contradicted(found: Sequence[Conflict], explained: bool) -> str:
-    """Return the best verdict that the contradictions allow: "no", "with care", or "" if they allow any verdict.
+    """Return the most favourable verdict that the contradictions allow: "no", "with care", or "" if they allow any
+    verdict.
 
     explained: whether the model explains the motion. If it does not, a missing effect has distorted the value, and
     presumably all others as well.

@@ -1,10 +1,10 @@
 """Comparison of the mean torque over the last few tenths of a second with the model from before that time.
 
 A push or grip that begins while the model is still being learnt distorts it, so that no residual stands out. The
-earlier model does not follow it. Its prediction for all samples since then is therefore compared with the mean torque
-over that time: over the last 5, 10 and 20 lessons (updates of the model), which last 0.1, 0.2 and 0.4 s. In the mean,
-effects that alternate with the motion (noise, play, ripple) cancel, but a push does not. If the joint has hardly moved
-in that time, friction may have held it back.
+earlier model is unaffected. Its prediction for all samples since then is therefore compared with the mean torque over
+that time: over the last 5, 10 and 20 lessons (updates of the model), which last 0.1, 0.2 and 0.4 s. Averaging cancels
+effects that alternate with the motion (noise, play, ripple), but not a push. If the joint has hardly moved in that
+time, the static friction that may have held it is subtracted.
 
 The terms of a joint's equation, `torque - row theta`, are summed over time, so that the mean between any two stored
 moments requires one subtraction. These functions are part of compiled loops.
@@ -30,11 +30,11 @@ is not exact in the next one: in a fast swing, terms several times as large as t
 """
 
 IN_A_ROW = 2
-"""Number of successive lessons (updates of the model) after which an unexplained mean residual torque is reported."""
+"""Number of successive lessons (model updates) with unexplained mean residual torque after which it is reported."""
 
 ELASTIC_RAD = 0.03
-"""Distance after a reversal over which dry friction approaches its sliding value [rad]. The difference between the two
-may at first be as large as static friction, and falls exponentially with the distance covered.
+"""Distance after a reversal over which dry friction approaches its sliding value [rad]. Their difference can at first
+be as large as static friction, and falls exponentially with the distance covered.
 """
 
 _SLOTS = max(BACK)

@@ -12,16 +12,16 @@ of arms, and are updated with each sample (recursive least squares, that is, a K
 slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as it moves.
 
 A joint's residual torque is the part that the motion does not account for. An alarm is raised if it exceeds three
-thresholds for `HOLD_S` (a shorter time if it exceeds them by far): `TIMES` standard deviations of the uncertainty due
-to parameters and noise, the torque that friction can hold while the joint stands still, and a fraction of the largest
+thresholds for `HOLD_S` (a shorter time if it far exceeds them): `TIMES` standard deviations of the uncertainty due to
+parameters and noise, the torque that friction can hold while the joint stands still, and a fraction of the largest
 planned torque. The noise is estimated as well: effects that the model lacks (Stribeck friction, backlash, flexibility)
-widen the admissible range. A deviation that may become an alarm enters that estimate only after it has ended without an
-alarm; otherwise a joint that is held for a long time would widen the range until nothing exceeded it. While a joint
-stands still, its noise is lower, since most of the noise only arises in motion.
+widen the admissible range. A deviation that could lead to an alarm enters that estimate only once it has subsided
+without one; otherwise a joint that is held for a long time would widen the range until nothing exceeded it. While a
+joint stands still, its noise is lower, since most of the noise only arises in motion.
 
 While a joint's angle stays within its gear's play for `_STAYS_S`, the velocity that it reports does not show in which
-direction friction acts: the motor may stick while the link floats from one side of the play to the other. What
-friction in either direction may hold then brings no alarm nearer.
+direction friction acts: the motor may stick while the link floats from one side of the play to the other. Torque that
+friction in either direction could balance then does not contribute to an alarm.
 
 What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which the
 gear's presliding softens every reversal, dry friction looks viscous but still holds the joint once it has stopped.
@@ -77,7 +77,7 @@ _STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, t
 _LESSONS = 2.0  # number of successive updates that share an error of the model
 _STANDING_LESSONS = 28.0  # the same, for the rounding of velocities that stay below a tick while a joint hardly moves
 _DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # drift of a parameter per second, relative to its value and to its initial deviation
-_MOST_WEIGHT = 6.0  # maximum weight of a sample whose residual torque exceeds the threshold by far
+_MOST_WEIGHT = 6.0  # maximum weight of a sample whose residual torque far exceeds the threshold
 _OBVIOUS = 3.0  # multiple of the threshold at which one sample is enough at slow rates
 _WARM_S = 3 * FILTER_S
 _LONGEST_GAP = 3.0  # number of intervals between two samples after which the observer restarts
@@ -386,7 +386,7 @@ def _accelerates(m: Any, j: int, slope: float) -> bool:
 
 
 def _floor(m: Any, k: Any, j: int) -> float:
-    """Return the smallest torque that may raise an alarm, lower for a joint whose friction turns out to be small."""
+    """Return the smallest torque that can raise an alarm; it is lower if the joint's friction turns out to be small."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
     return float(max(k[2 + j], min(k[_HIGHEST + j], k[_HIGHEST + 2] * dry)))
 

@@ -52,7 +52,7 @@ class Quantities:
     std: dict[str, float]
     """Standard errors of `value` by name [SI]."""
     groups: tuple[tuple[str, ...], ...]
-    """Groups of quantities that cannot be separated; at least one more quantity of each group must be known."""
+    """Groups of quantities that cannot be separated; at least one more quantity in each group must be known."""
     doubts: tuple[str, ...]
     """Warnings about known quantities that contradict the data, and about physically impossible quantities."""
 

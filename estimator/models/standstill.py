@@ -6,10 +6,10 @@ is compared with the largest and the smallest one since the joint came to rest: 
 offset cancel in these differences, and so do their errors. Only changes due to the motion of other joints have to be
 modelled.
 
-A torque outside the band accelerates a free joint. The joint counts as blocked once a free joint would show in the
-velocity register. Twice that momentum is required, because only half of the excess is certain to act on the joint: the
-position of the band is unknown. If a joint does move again, friction had been holding it: a torque that did not move it
-before never raises an alarm again.
+A torque outside the band accelerates a free joint. The joint counts as blocked once the motion of a free joint would
+show in the velocity register. Twice the momentum of that motion is required, because only half of the excess is certain
+to act on the joint: the position of the band is unknown. If a joint does move again, friction had been holding it: a
+torque that did not move it before never raises an alarm again.
 
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """
@@ -23,7 +23,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.compiled import inner
 
 WITHIN_RAD = 0.004
-"""Largest change of the angle of a joint that is at rest [rad]; covers encoder noise and gear play."""
+"""Largest change in the angle of a joint that is at rest [rad]; covers encoder noise and gear play."""
 
 AT_REST = 0.95
 """Filtered standstill indicator above which a joint counts as at rest; by then, the filtered deceleration has decayed.
@@ -34,7 +34,7 @@ HOLD_S = 0.03
 
 _SINGLES = 9
 # Scalars of a joint, before its two equations: angle at which it came to rest, whether an equation is stored, half of
-# the range that it withstood before it moved again, torque of the equations with the least and largest residual,
+# the range that it withstood before it moved again, torque of the equations with the lowest and highest residual,
 # largest range so far beyond the velocity's rounding, excess momentum to either side, and its duration.
 _ANGLE, _SEEN, _WITHSTOOD, _LEAST, _MOST, _RANGE, _UP, _DOWN, _LASTS = range(_SINGLES)
 

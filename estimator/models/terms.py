@@ -2,8 +2,8 @@
 
 Fits, results, reports, exports and the configuration take names, units, descriptions, ranges, initial guesses and
 scales from here; docs/architecture.md lists the files that a new term touches. Parameters are named `term_joint`, with
-joints counted from 1, and terms of the whole arm just `term`. It imports only the standard library, so that reading a
-result is fast.
+joints counted from 1, and those of the whole arm are named just `term`. This module imports only the standard library,
+so that reading a result is fast.
 """
 
 import re
@@ -115,7 +115,7 @@ class Term:
     friction.
     """
     max_step: float | None = None
-    """Maximum change of the term's coordinate (for positive terms, a logarithm) per iteration; None for the fit's
+    """Maximum change in the term's coordinate (for positive terms, a logarithm) per iteration; None for the fit's
     limit.
     """
     standstill: bool = False
@@ -358,7 +358,7 @@ def extra_names(
 ) -> tuple[str, ...]:
     """Return the names of the other parameters of a model with these `parts`; by default of all parts.
 
-    by_voltage: joints, from 1, that are driven by voltage; by default all.
+    by_voltage: joints (from 1) that are driven by voltage; by default all.
     """
     return tuple(
         name

@@ -1,8 +1,8 @@
-"""Missing model terms, judged without fitting them: score tests, and the effect of omission on standard errors.
+"""Missing model terms, evaluated without fitting them: score tests, and the effect of omission on standard errors.
 
 Near an estimate the motion is linear in small changes of any parameter. One simulation with derivatives with respect to
-all of them yields the decrease of the sum of squares that each term would bring (C. R. Rao's score test, Proc.
-Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the fitted parameters. Terms that cannot be ruled out,
+all of them yields the decrease in the sum of squares that each term would bring (C. R. Rao's score test, Proc.
+Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes in the fitted parameters. Terms that cannot be ruled out,
 such as an encoder's zero or torque saturation, therefore widen the standard errors even if the motion does not reveal
 them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3 (1966) 293), with their typical size as the
 prior.
@@ -45,7 +45,7 @@ class Candidate:
     names: tuple[str, ...]
     """Names of the parameters that are added."""
     evidence: float
-    """Decrease of the sum of squares relative to that expected by chance: above 1 it is significant."""
+    """Decrease in the sum of squares relative to that expected by chance: above 1 it is significant."""
     explained: float
     """Fraction of the sum of squares that the term explains."""
     values: Mapping[str, float]
@@ -99,7 +99,7 @@ class Linearised:
         return [self.names.index(name) for name in names]
 
     def fall(self, names: Sequence[str]) -> tuple[float, Array]:
-        """Return the decrease of the sum of squares if the parameters `names` are freed, and the changes in their
+        """Return the decrease in the sum of squares if the parameters `names` are freed, and the changes in their
         values.
 
         The initial state is freed as well.
@@ -241,7 +241,7 @@ def simulated_run(period: SettledPeriod) -> Run:
 
 
 def colour(residual: Array) -> float:
-    """Return the worst joint's integrated autocorrelation of a residual (joints, samples); 1 for white noise.
+    """Return the integrated autocorrelation of a residual (joints, samples) for the worst joint; 1 for white noise.
 
     Missing samples count as 0.
     """
@@ -255,7 +255,7 @@ def colour(residual: Array) -> float:
 
 
 def richer_models(model: Model) -> dict[str, Model]:
-    """Return the models with one more option or the next friction law, by the part that is added.
+    """Return the models with one more option or the next friction law, keyed by the part that is added.
 
     Presliding is left out, since the motion is not linear in its parameters.
     """

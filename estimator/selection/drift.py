@@ -1,4 +1,4 @@
-"""Changes of friction during motion: as grease warms up, friction falls by a few percent within minutes.
+"""Changes in friction during motion: as grease warms up, friction falls by a few percent within minutes.
 
 A fit of one period, or of the mean of several, is valid for the middle of their time span. Other periods then show
 whether friction was larger or smaller: the difference in motion is nearly linear in one factor per joint, for viscous
@@ -21,10 +21,10 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import by_parameters, colour, linearised, simulated_run
 
 ITERATIONS = 3
-LEAST = 0.005  # minimum relative change of friction that matters
-MOST = 0.3  # maximum relative change of friction in one iteration
+LEAST = 0.005  # minimum relative change in friction that matters
+MOST = 0.3  # maximum relative change in friction in one iteration
 SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step, tried until the prediction improves
-TELLS = 0.5  # part of what a change of friction leaves, below which a constant torque is the better explanation
+TELLS = 0.5  # fraction of the residual after a change in friction below which a constant torque explains it better
 NOTICED = 0.01  # constant torque, relative to the joint's RMS torque, below which it does not matter
 UNEVEN = 0.25  # relative part of a change that is not linear in time, or not the same for all friction
 SCALED = ("viscous", "coulomb", "load", "viscous_asymmetry")
@@ -32,7 +32,7 @@ SCALED = ("viscous", "coulomb", "load", "viscous_asymmetry")
 
 @dataclass(frozen=True)
 class Drift:
-    """Relative change of each joint's friction from the fitted periods to later ones."""
+    """Relative change in each joint's friction from the fitted periods to later ones."""
 
     change: Array
     """Change as a fraction of the friction in the fitted periods (joints,); negative if friction fell."""
@@ -70,7 +70,7 @@ def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
     during `period`.
 
     The fit assumes constant friction. If friction changes at the rate of `drift`, other parameters absorb part of this
-    slow change of torque. The motion is assumed to follow the instantaneous friction, which holds if transients decay
+    slow change in torque. The motion is assumed to follow the instantaneous friction, which holds if transients decay
     within a small part of the period.
     """
     about = linearised(period, estimate, (), {})
@@ -95,7 +95,7 @@ def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
 
 
 def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -> Drift:
-    """Return the change of friction from `estimate` to `period`, which is `seconds` [s] later.
+    """Return the change in friction from `estimate` to `period`, which is `seconds` [s] later.
 
     It is found by Gauss-Newton iterations on one factor per joint and the initial state; all other parameters are
     fixed. A step that does not improve the prediction is shortened. If no simulation from the period's start stays
@@ -107,7 +107,7 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
 
 @dataclass(frozen=True)
 class TorqueChange:
-    """Constant torque of each joint that acts in the later periods only."""
+    """Constant torque on each joint, acting in the later periods only."""
 
     change: Array
     """Torque (joints,) [N m]."""
@@ -116,7 +116,7 @@ class TorqueChange:
     left: float
     """Sum of squares of the residual that the torque does not explain, in units of the noise."""
     noticed: Array
-    """Smallest constant torque of each joint that matters (joints,) [N m]."""
+    """Smallest constant torque that matters, for each joint (joints,) [N m]."""
 
     @property
     def is_seen(self) -> Mask:
@@ -125,7 +125,7 @@ class TorqueChange:
         return seen
 
     def explains_better_than(self, drift: Drift) -> bool:
-        """Whether a change of constant torque is significant and explains much more than a change of friction does."""
+        """Whether a change in constant torque is significant and explains much more than a change in friction does."""
         return bool(self.is_seen.any()) and self.left < TELLS * drift.left
 
 

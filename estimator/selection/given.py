@@ -1,4 +1,4 @@
-"""Fit of a model with given terms, with two searches for the periods of its ripple and cogging.
+"""Fit of a model with given terms, including two searches for the periods of its ripple and cogging.
 
 The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period if all other effects are modelled
 well. The linear regression cannot represent encoder errors, cables and narrow Stribeck friction. If they matter, the

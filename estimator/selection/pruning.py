@@ -1,4 +1,4 @@
-"""Removal of terms that do not differ significantly from zero, judged by the covariance without another fit."""
+"""Removal of terms that do not differ significantly from zero according to the covariance, without another fit."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +16,7 @@ from hil.estimator.models.terms import FRICTIONS, Option, kind_of, term_of
 def without_nothings(estimate: Estimate, level: float, fixed: Option | None) -> Model:
     """Return the model without parts that do not differ significantly from zero, the least significant removed first.
 
-    Significance is judged by A. Wald's test (Trans. AMS 54 (1943) 426): the squared distance from zero in standard
+    Significance is determined by A. Wald's test (Trans. AMS 54 (1943) 426): the squared distance from zero in standard
     errors, compared with chi^2 at `level`. The remaining parameters are updated with the linearised model.
     """
     return pruned_model(estimate.model, estimate.names, estimate.value, estimate.covariance, level, fixed)

@@ -18,7 +18,7 @@ from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.waves import ranked_cycles, wave_peaks, without_height
 
 ALIKE_STIFFNESS = 3.0  # ratio of two stiffnesses between which no minimum is expected
-WIDE = 0.5  # width of the Coulomb step over the Stribeck velocity above which the two cannot be told apart
+WIDE = 0.5  # width of the Coulomb step over the Stribeck velocity above which the two cannot be separated
 NARROW = 1e-3  # rad/s: initial width of an undisguised step
 ALIKE_CYCLES = 0.3  # difference of two numbers of cycles per turn between which no minimum is expected
 

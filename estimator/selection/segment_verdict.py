@@ -117,8 +117,8 @@ def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, 
 
 
 def _rules(left: float, held_out: Array | None, weakest: str, part: float, unclear: bool) -> tuple[str, ...]:
-    """Name each number beyond its limit for "yes". part: relative standard error of the parameter `weakest`. unclear:
-    whether undetermined friction near standstill may have affected other parameters.
+    """Name each number that exceeds its limit for "yes". part: relative standard error of the parameter `weakest`.
+    unclear: whether undetermined friction near standstill may have affected other parameters.
     """
     limit = EXPLAINED if held_out is None else MUCH_LEFT
     rules = {
@@ -138,7 +138,7 @@ def _is_refused(left: float, held_out: Array | None, evidence: SegmentEvidence) 
 
 
 def _refused(left: float, held_out: Array | None, evidence: SegmentEvidence) -> tuple[str, ...]:
-    """Name the rule that makes the verdict "no", and a remedy unless the recordings are already said to be at fault."""
+    """Name the rule that makes the verdict "no", and a remedy unless faults of the recordings are already reported."""
     if evidence.faulty or not _is_refused(left, held_out, evidence):
         return ()
     remedy = "" if evidence.spoiled else ": check the columns, their units, and whether anything touched the arm"

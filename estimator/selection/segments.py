@@ -1,4 +1,4 @@
-"""Validation of fits to segments: missing terms, standard errors that include them, prediction of held-out motion."""
+"""Validation of fits to segments: missing terms, standard errors that allow for them, prediction of held-out motion."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -85,7 +85,7 @@ def held_out_errors(
 
     The initial state of a segment is estimated from its first third; the rest is predicted from the torque alone. The
     median is taken over segments, since the error can be huge if the arm tumbles. A prediction that diverges counts as
-    wrong by half a turn.
+    an error of half a turn.
     """
     problem = _posed(recordings, estimate, of)
     values, joints = estimate.parameters, estimate.model.joints

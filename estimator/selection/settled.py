@@ -1,4 +1,4 @@
-"""Friction model selection: models are fitted from simple to rich and judged on a held-out motion.
+"""Friction model selection: models are fitted from simple to rich and evaluated on a held-out motion.
 
 A richer model's open-loop prediction of another motion improves only if its terms are real, or by chance. Therefore it
 must also reduce the residual by more than meaningless terms would. Without another motion, the Bayesian information
@@ -49,10 +49,10 @@ def choose(
     First, Stribeck friction is fitted together with the encoders' zeros and the ratio of two torque constants, which
     are never known exactly. If that does not explain the motion, or if a score test finds a significant term in the
     residual (`hil.estimator.selection.candidates`), all other smooth terms are added at once: load, direction,
-    saturation, cables, encoder nonlinearity. One by one, each would absorb the effects of the missing ones; together,
-    with typical sizes as a prior, they can be separated. Then presliding friction and torque ripple are tried, and
-    finally insignificant terms are removed. A model that predicts `held_out` worse than a simpler one is not chosen. If
-    friction differs between the two recordings, it also changed within each; this is corrected
+    saturation, cables, encoder nonlinearity. If added one by one, each would absorb the effects of the missing ones;
+    together, with typical sizes as a prior, they can be separated. Then presliding friction and torque ripple are
+    tried, and finally insignificant terms are removed. A model that predicts `held_out` worse than a simpler one is not
+    chosen. If friction differs between the two recordings, it has also changed within each, which is corrected for
     (`hil.estimator.selection.steadied`).
 
     Args:
@@ -61,7 +61,7 @@ def choose(
             used.
         drive: drive model of all candidates.
         torque_scale: whether the ratio of the torque constants is always kept.
-        by_voltage: joints, from 1, that are driven by voltage.
+        by_voltage: joints (from 1) that are driven by voltage.
         lever: as for `hil.estimator.models.model.Model`.
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
         seconds: time from the middle of `periods` to that of `held_out` [s], if known.
@@ -114,7 +114,7 @@ class Selection:
 
     @property
     def drift(self) -> Drift | None:
-        """The change of friction for which the periods are corrected."""
+        """The change in friction for which the periods are corrected."""
         return self._fitting.drift
 
     def _begin(self, model: Model, near: Trial | None = None, *, coarse: bool = False) -> None:
@@ -161,7 +161,7 @@ class Selection:
         return self._undisguised(self._without_bristles(again))
 
     def _undisguised(self, best: Trial) -> Trial:
-        """Refit with narrow Coulomb steps where the Stribeck rise may only imitate them, if that explains more."""
+        """Refit with narrow Coulomb steps where these could cause the apparent Stribeck rise; keep the better fit."""
         values = {} if best.estimate is None else undisguised(best.estimate)
         return self._better(self._try_or_none(best.model, best, values), best) or best if values else best
 
@@ -196,7 +196,7 @@ class Selection:
         return sorted(kinds.values(), key=self._left)
 
     def _steadied(self, trial: Trial | None) -> Trial | None:
-        """Correct the periods for a change of friction, if one is found and the motion is then explained equally well.
+        """Correct the periods for a change in friction, if one is found and the motion is then explained equally well.
 
         The change is estimated from the uncorrected recordings, so that a later call, with a better model, replaces or
         withdraws an earlier correction. Returns the fit of the corrected periods, or else `trial`.
@@ -336,7 +336,7 @@ class Selection:
         return best
 
     def _pruned_by_fits(self, best: Trial) -> Trial:
-        """Remove terms one by one, judging each by a fit without it, if the motion is too sensitive for standard
+        """Remove terms one by one, assessing each by a fit without it, if the motion is too sensitive for standard
         errors.
         """
         for part, plainer in removable_parts(best.model):

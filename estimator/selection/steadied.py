@@ -36,7 +36,7 @@ def friction_torque(period: SettledPeriod, estimate: Estimate) -> Array:
 def steadied(period: SettledPeriod, estimate: Estimate, drift: Drift) -> SettledPeriod:
     """Return `period` with the torque that its motion would have required had friction stayed at its mid-period value.
 
-    estimate: fitted to this period, or to one with the same friction. drift: change of friction over `drift.seconds`.
+    estimate: fitted to this period, or to one with the same friction. drift: change in friction over `drift.seconds`.
     """
     seconds = np.arange(period.samples) / period.rate
     since = (seconds - seconds.mean()) / drift.seconds

@@ -50,9 +50,9 @@ class Choice:
     trials: tuple[Trial, ...]
     chosen: Trial
     period: SettledPeriod
-    """The first period as it was fitted: corrected for a change of friction, if one was seen."""
+    """The first period as it was fitted: corrected for a change in friction, if one was seen."""
     drift: Drift | None = None
-    """The change of friction for which the period was corrected; None for no correction."""
+    """The change in friction for which the period was corrected; None for no correction."""
 
     @property
     def estimate(self) -> Estimate:
@@ -102,7 +102,7 @@ class Fitting:
     held_out: SettledPeriod | None
     starts: Sequence[Mapping[str, float]]
     drift: Drift | None = None
-    """Change of friction from the fitted periods to `held_out`; both are corrected for it."""
+    """Change in friction from the fitted periods to `held_out`; both are corrected for it."""
 
     def trial(self, model: Model, near: Trial | None, values: Mapping[str, float], coarse: bool) -> Trial:
         """Fit `model` from the result of `near`, using `values` for the parameters that this result lacks, or from

@@ -1,12 +1,12 @@
 """Friction model selection for recordings without a settled period.
 
-As for settled periods (`hil.estimator.selection.settled`), Stribeck friction is fitted first.
-If it does not explain the motion, or if score tests find a significant term, all other smooth terms are added at once,
-with their typical sizes as a prior; then insignificant terms are removed.
+As for settled periods (`hil.estimator.selection.settled`), Stribeck friction is fitted first. If it does not explain
+the motion, or if score tests find a significant term, all other smooth terms are added at once, with their typical
+sizes as a prior; then insignificant terms are removed.
 
 If the motion is explained down to the noise, the likelihood decides. Otherwise a richer model may merely compensate for
-another missing term. Then every other segment of each recording is fitted and the rest are predicted, also by models
-with presliding friction.
+another missing term. Then every other segment of each recording is fitted and the rest are predicted, by models with
+presliding friction as well.
 """
 
 import time

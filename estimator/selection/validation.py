@@ -1,4 +1,4 @@
-"""Checks of an estimate: residual compared with rounding, whiteness, conditioning, open-loop simulation, lines."""
+"""Checks of an estimate: residual over rounding, whiteness, conditioning, open-loop simulation, Fourier lines."""
 
 from dataclasses import dataclass
 
@@ -54,7 +54,7 @@ class Validation:
     None if the simulation does not settle.
     """
     condition: float
-    """Condition number of the base parameters' correlation matrix: 1 means independent."""
+    """Condition number of the base parameters' correlation matrix; 1 if they are independent."""
     confounded: tuple[str, str, float]
     """The two base parameters that are hardest to separate, and their correlation."""
     relative_std: dict[str, float]

@@ -1,6 +1,6 @@
 """A verdict in words: whether to trust the estimate, its weaknesses, their causes, and how to improve it.
 
-"Yes" means that, as far as can be judged, every inertia, gravity and friction parameter is accurate to 2 % or three
+"Yes" means that, as far as can be determined, every inertia, gravity and friction parameter is accurate to 2 % or three
 standard errors. This relies on valid standard errors: those of the estimate are widened for effects that the model
 omits (`hil.estimator.selection.candidates.considered`) and for the unexplained part of the motion
 (`hil.estimator.fit.covariance`). No sentence recommends anything that the tool has already tried.
@@ -68,11 +68,11 @@ class Evidence:
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""
     drift: Drift | None = None
-    """Change of friction while the arm moved."""
+    """Change in friction while the arm moved."""
     torque: TorqueChange | None = None
-    """Constant torque in the held-out motion, if it explains that motion better than a change of friction does."""
+    """Constant torque in the held-out motion, if it explains that motion better than a change in friction does."""
     disturbances: tuple[str, ...] = field(default=())
-    """Faults of the recording itself, as sentences; they explain the residual and any change of friction."""
+    """Faults of the recording itself, as sentences; they explain the residual and any change in friction."""
     doubts: tuple[str, ...] = field(default=())
     """Implausible or contradictory values, as sentences."""
     notes: tuple[str, ...] = field(default=())
@@ -154,7 +154,7 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence,
 
 
 def unexplained_motion(joint: int, left: float) -> str:
-    """Return the beginning of a sentence about a joint, from 0, whose residual is `left` times the noise."""
+    """Return the beginning of a sentence about a joint (from 0) whose residual is `left` times the noise."""
     if left <= MUCH_LEFT:
         return f"The motion of joint {joint + 1} is not fully explained"
     return f"Joint {joint + 1} moves in a way that the model cannot explain"
@@ -183,7 +183,7 @@ def _in_words(part: str) -> str:
 
 
 def _spoilt(validation: Validation, trust: Trust) -> str:
-    """Return a sentence about parameters that the model error may bias, judged by their inflated standard errors."""
+    """Return a sentence about parameters that the model error may bias, selected by their inflated standard errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst and trust == "no":
         return "This error may bias all parameters, regardless of their standard errors."
@@ -204,7 +204,7 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
 
 
 def _distorted(validation: Validation) -> tuple[str, ...]:
-    """Return sentences about the response on unexcited lines, and on the part of it that the model does not explain."""
+    """Return sentences about the response on unexcited lines and the part of it that the model does not explain."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
         return (
@@ -258,7 +258,7 @@ def _pushed(torque: TorqueChange | None) -> tuple[str, ...]:
 
 
 def _reason(change: float, seconds: float) -> str:
-    """Return the possible cause of a change of friction, as the end of a sentence. Friction falls as a servo warms up;
+    """Return the possible cause of a change in friction, as the end of a sentence. Friction falls as a servo warms up;
     a rise always indicates a fault.
     """
     holds = "the identified values hold for the fitted periods"
@@ -273,7 +273,7 @@ def _reason(change: float, seconds: float) -> str:
 
 
 def _warm_up(seconds: float) -> int:
-    """Return a warm-up [s] that should suffice if friction still changed between motions `seconds` apart."""
+    """Return a warm-up time [s] that should suffice if friction still changed between motions `seconds` apart."""
     return int(WARM_UP_ROUNDING * np.ceil(WARM_UP_TIMES * seconds / WARM_UP_ROUNDING))
 
 
@@ -338,7 +338,7 @@ def _alike(validation: Validation) -> tuple[str, ...]:
 
 
 def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
-    # If the model is incomplete, a reading far from it is not necessarily wrong.
+    # If the model is incomplete, a reading far from its prediction is not necessarily wrong.
     if not estimate.outliers or not explained:
         return ()
     one = estimate.outliers == 1

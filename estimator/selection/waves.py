@@ -15,7 +15,7 @@ from hil.estimator.selection.candidates import columns_of, simulated_run
 
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 COMPARABLE = 0.3
-"""Minimum decrease of the sum of squares, as a fraction of the largest, for other numbers of cycles to be tried too."""
+"""Minimum decrease in the sum of squares, as a fraction of the largest, for other numbers of cycles to be tried too."""
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of a motion that diverges with coarse steps
@@ -33,7 +33,7 @@ def wave_peaks(
     parameter name. If other terms have absorbed part of a wave, the best number may be wrong. Therefore other numbers
     are returned as well if they explain at least `COMPARABLE` times as much of the sum of squares as the best one.
 
-    only: joints to consider, from 1; by default all.
+    only: joints (from 1) to consider; by default all.
     """
     used = without_spikes(period)
     run = simulated_run(used).integrated(COARSE)
@@ -69,12 +69,12 @@ def ranked_cycles(peaks: Mapping[str, Sequence[float]], most: int) -> list[dict[
 
 
 def without_height(wave: Wave, joints: Iterable[int]) -> dict[str, float]:
-    """Return zero amplitudes of a wave for `joints`, from 1, by parameter name."""
+    """Return zero amplitudes of a wave for `joints` (from 1), by parameter name."""
     return {f"{wave}_{part}_{joint}": 0.0 for part in ("sin", "cos") for joint in joints}
 
 
 def _peaks(cycles: Sequence[float], falls: Array) -> tuple[float, ...]:
-    """Return those `cycles` whose decrease of the sum of squares is a local maximum, the largest first."""
+    """Return those `cycles` whose decrease in the sum of squares is a local maximum, the largest first."""
     order = np.argsort(cycles)
     padded = np.concatenate(([-1.0], falls[order], [-1.0]))
     is_peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])

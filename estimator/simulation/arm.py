@@ -91,7 +91,7 @@ def simulate(
     vector = physics.vector.copy()
     pulls = np.zeros((2, samples if springs is not None else 0))
     if springs is not None:
-        # A spring is a cable, and an offset that changes from sample to sample.
+        # A spring is modelled as a cable plus an offset that changes from sample to sample.
         stiffness, ends = springs
         vector[CABLE : CABLE + joints] += stiffness
         pulls[:joints] = stiffness[:, None] * ends
@@ -104,7 +104,7 @@ def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> NDA
     """Return the number of substeps, at most `most`, for a step of `step` [s] while each joint is near standstill.
 
     Within one substep, a reversal of dry friction may take a joint through a quarter of its Coulomb step's width. The
-    numbers are powers of two, so that small changes of the physics seldom change them and hence the last digits of the
+    numbers are powers of two, so that small changes in the physics seldom change them and hence the last digits of the
     motion.
     """
     needed = [min(4.0 * step / max(time, 1e-12), most) for time in physics.crossing_times()]
@@ -118,8 +118,8 @@ def bump_at(ratio: float) -> float:
 
 
 def bend_at(v: float, sharp: float) -> tuple[float, float]:
-    """Return tanh(v sharp) and its derivative with respect to v, using one exponential: half the time of the library's
-    tanh.
+    """Return tanh(v sharp) and its derivative with respect to v, using one exponential, which takes half as long as the
+    library's tanh.
     """
     past = 2.0 * abs(v) * sharp
     if not past < FADED:

@@ -77,7 +77,7 @@ def neglected_inertia(brake: float, lost: float, inertia: float, delay: float) -
     """Return the standard deviation of a joint's inertia due to effects that this model neglects [kg m^2].
 
     The effect of friction on the motor's current is late by lag' - lag: negligible on most arms, but 5 % of the inertia
-    of an XL430 with hardly any load. The voltage's delay d is 1 to 2 %.
+    of an XL430 with hardly any load. The voltage's delay d contributes 1 to 2 %.
 
     brake: b [N m s/rad]. lost: b lag' [kg m^2]. delay: pure delay [s], perhaps of the voltage alone.
     """

@@ -1,4 +1,4 @@
-"""Presliding friction: bristles between the surfaces that deflect, and slip when deflected far enough.
+"""Presliding friction: bristles between the surfaces, which deflect and, once deflected far enough, slip.
 
     friction = b + damping (1 - b / +-level(v)) v        b' = stiffness v (1 - b / +-level(v))
 

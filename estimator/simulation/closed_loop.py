@@ -1,4 +1,4 @@
-"""The arm's motion under commands that depend on its state: a software spring and damper, a brake.
+"""The arm's motion under commands that depend on its state: those of a software spring and damper, or of a brake.
 
 The equations, including the torque scale, and the default integration step are those of `hil.estimator.simulation.arm`.
 A command is computed once per sample from the state at the previous sample, as on the real bus, then limited and held;
@@ -102,7 +102,9 @@ class Stabilised:
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
-    """Return the physics with the delay added to the lag, less `command_to_sample` [s]: commands act earlier."""
+    """Return the physics with the delay added to the lag, minus `command_to_sample` [s]: commands act that much
+    earlier.
+    """
     return replace(physics, lag=max(physics.lag + physics.delay - command_to_sample, 1e-5), delay=0.0)
 
 

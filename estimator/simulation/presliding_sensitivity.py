@@ -122,7 +122,7 @@ def _bend(
     Z: Any,
     count: int,
 ) -> None:
-    """Apply `hil.estimator.simulation.bristles.bend` and its derivatives; the step's middle is `ahead` [s] from now."""
+    """Apply and differentiate `hil.estimator.simulation.bristles.bend`; the step's middle is `ahead` [s] from now."""
     at, D, level_by, give_by, faster_by, began, faster = bristles
     for joint in range(2):
         stiffness = p[STIFFNESS + joint]

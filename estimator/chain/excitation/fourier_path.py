@@ -202,8 +202,8 @@ class Goal:
 
     @cached_property
     def _products(self) -> Array:
-        """Regressor for the other motions, in units of the prior's standard deviations, multiplied by itself and summed
-        over the samples (joints, base parameters, base parameters).
+        """Products of the regressor's columns for the other motions, in units of the prior's standard deviations,
+        summed over the samples (joints, base parameters, base parameters).
         """
         others = self._motions * self.prior.std
         products: Array = np.swapaxes(others, 1, 2) @ others

@@ -36,7 +36,7 @@ FIRST_STEP, FASTER, SLOWER = 0.3, 1.1, 0.9
 SHRINKS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
 SWING_SHARE = 0.9  # fraction of the distance from a centre to the nearer limit
 LEAST_SWING_SHARE = 0.15
-_MEAN_SHARE = 0.1  # weight of the mean log error in the criterion; the worst one has the rest
+_MEAN_SHARE = 0.1  # weight of the mean log error in the criterion; the log of the worst has the rest
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class PathDesigner:
         return float(errors.max()), float(np.median(errors))
 
     def _start(self, random: np.random.Generator, told: Callable[[], None]) -> tuple[Array, Array]:
-        """Return the centre and coefficients of the best random path about random centres or the limits' middle."""
+        """Return the centre and coefficients of the best random path; the centres are random or the limits' middle."""
         low, high = self._limits.low, self._limits.high
         best: tuple[float, Array, Array] | None = None
         for number in range(CENTRES):

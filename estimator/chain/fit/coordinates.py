@@ -45,12 +45,12 @@ SHAPES = {
 }
 """Priors on the shape of friction and on drives: typical value [in its unit] and standard deviation of its logarithm.
 
-Early in a fit they are held fixed: a lag that is driven to zero while other errors dominate would hardly recover.
+Early in a fit, these parameters are held fixed: a lag driven to zero while other errors dominate would hardly recover.
 """
 ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
 """Priors on small angles that gravity may not reveal: standard deviations around zero [rad]."""
 RESHAPING = 1.0  # maximum change of their logarithms in one step
-NARROWING, WIDENING = 1.6, 1.1  # maximum decrease and increase of a width's logarithm in one step
+NARROWING, WIDENING = 1.6, 1.1  # maximum decrease and increase in a width's logarithm in one step
 LONGEST = 2.0  # maximum change of any coordinate in one step
 
 
@@ -96,7 +96,7 @@ class ChainCoordinates:
         return y
 
     def room_below(self, x: Array) -> Array:
-        """Return the largest possible decrease of each parameter's coordinate, as a negative number or 0
+        """Return the largest possible decrease in each parameter's coordinate, as a negative number or 0
         (parameters,).
 
         Only widths have a floor; `x` may end with other coordinates.

@@ -22,13 +22,13 @@ class HeldZeros:
     shift: Array
     """Estimated true minus measured angle (joints - 1,) [rad]; close to 0 if gravity does not reveal it."""
     gain: float
-    """Expected decrease of the sum of squares if the zeros were fitted, in units of the white-noise variance."""
+    """Expected decrease in the sum of squares if the zeros were fitted, in units of the white-noise variance."""
 
 
 def held_zeros(problem: ChainProblem, x: Array, unfinished: float) -> HeldZeros:
     """Estimate the encoder zeros that `problem` holds at 0, evaluated at its minimum `x`.
 
-    unfinished: expected decrease of the sum of squares in one more step that does not fit the zeros.
+    unfinished: expected decrease in the sum of squares in one more step that does not fit the zeros.
     """
     model = replace(problem.model, zeros=True)
     names, size = model.names, len(model.names)

@@ -2,8 +2,8 @@
 
 An observer keeps the simulation close to the measured angles, even for an arm that is unstable without feedback: each
 position is predicted from past measurements and the model (the prediction error method; Ljung, System Identification,
-2nd ed. 1999, chapter 7). Stiff gains follow any motion but carry little information; soft gains carry nearly as much as
-an open-loop simulation.
+2nd ed. 1999, chapter 7). A stiff observer follows any motion but yields little information; a soft one yields nearly as
+much as an open-loop simulation.
 """
 
 from collections.abc import Iterator
@@ -70,7 +70,7 @@ class ChainProblem:
     `steps` is 1.
     """
     reach: float = 1.0
-    """Fraction of their maximum change per step that friction-shape parameters may use; less near the minimum."""
+    """Fraction of their maximum change per step that friction-shape parameters may use; smaller near the minimum."""
     prior_weight: float = 1.0
     """Scale of the prior's precision; above 1 while model errors exceed the noise that the weights assume, so that the
     prior still decides what the data do not determine.
@@ -241,7 +241,7 @@ class ChainProblem:
             yield simulation.go_on(run, slice(0, len(run.measured)))[0]
 
     def _knows(self, x: Array) -> bool:
-        """Whether the latest simulation with derivatives was of this problem at `x`."""
+        """Whether the latest simulation with derivatives was that of this problem at `x`."""
         latest = self.latest
         return (
             latest.x is not None

@@ -17,7 +17,7 @@ def remaining(minimum: Minimum, coordinates: ChainCoordinates) -> tuple[Array, f
     If the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
     """
     at, least = minimum.at, np.full(minimum.x.size, -np.inf)
-    # To first order, a decrease of a logarithm by 1 takes the parameter to 0.
+    # To first order, a decrease of 1 in a logarithm takes the parameter to 0.
     lowest = np.where(coordinates.positive, -1.0, -np.inf)
     least[: len(coordinates.names)] = np.maximum(coordinates.room_below(minimum.x), lowest)
     scale = np.sqrt(np.diag(at.normal))

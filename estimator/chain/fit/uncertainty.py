@@ -25,7 +25,7 @@ from hil.estimator.chain.model.late_torque import lost_inertia, rotor
 from hil.estimator.simulation.back_emf import neglected_inertia
 
 MOST_SAMPLES = 1 << 13  # of a period: enough to estimate a noise level to within a tenth
-SUPPOSED = 10.0  # degrees of freedom assigned to white noise, and to the common level in that of each joint
+SUPPOSED = 10.0  # degrees of freedom of white noise in the common level, and of the common level in that of each joint
 
 
 def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array:

@@ -11,7 +11,7 @@ over the mass, it is
 so that twelve numbers per body replace its 36. The regressor is that of Atkeson, An and Hollerbach, International
 Journal of Robotics Research 5 (1986) 101, in link frames.
 
-Every formula is linear in the inertial parameters, so base parameters, with all others zero, may replace them.
+Every formula is linear in the inertial parameters, so base parameters, with all others zero, can replace them.
 """
 
 import math
@@ -303,7 +303,7 @@ def regress(column: Any, a: Any, room: Any, Y: Any) -> None:
 def pull(gravity: Any, room: Any, column: int, out: Any) -> None:
     """Set a column of `out` (joints, columns) to the torques that hold all links still under this gravity alone.
 
-    Call `move` first. The torques are linear in gravity, so passing a change of gravity yields the change of the
+    Call `move` first. The torques are linear in gravity, so passing a change in gravity yields the change in the
     torques.
     """
     motion, body = room[1], room[2]

@@ -58,7 +58,7 @@ def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[
 def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -> tuple[str, ...]:
     """Return the names of the lagging back-EMFs that would cancel more inertia than the simulation allows.
 
-    This biases the estimated inertias. A back-EMF is named only if its loss exceeds the standard error of a base
+    The limit biases the estimated inertias. A back-EMF is named only if its loss exceeds the standard error of a base
     parameter. std: standard errors of the base parameters; those of other parameters may follow.
     """
     generating = _generating(base.chain.joints, parameters)
@@ -79,7 +79,7 @@ def rotor(base: BaseParameters, joint: int) -> Array:
 
 
 Losses = list[tuple[Array, dict[int, float]]]
-"""For each voltage-driven joint: what its rotor adds to the base parameters (base parameters,), and the decrease of its
+"""For each voltage-driven joint: what its rotor adds to the base parameters (base parameters,), and the decrease in its
 inertia [kg m^2] per unit of each parameter that its lagging back-EMF depends on, keyed by that parameter's index.
 """
 

@@ -2,8 +2,8 @@
 
 Each link is described by ten log-Cholesky coordinates (Rucker and Wensing, IEEE Robotics and Automation Letters 7
 (2022) 8250): its pseudo-inertia is U U', where U is upper triangular with a positive diagonal, so that every point
-corresponds to a possible mass distribution. What the base parameters leave open is weakly regularised towards the
-description.
+corresponds to a possible mass distribution. Quantities that the base parameters leave open are weakly regularised
+towards the description.
 """
 
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS
 
-PULL = 0.03  # weight of a unit change of a coordinate, relative to one standard error of a base parameter
+PULL = 0.03  # weight of a unit change in a coordinate, relative to one standard error of a base parameter
 LEAST_MASS = 1e-4  # kg
-LEAST_SPREAD = 1e-3  # m: minimum radius of gyration, for links that the description makes a point mass
+LEAST_SPREAD = 1e-3  # m: minimum radius of gyration, for links described as point masses
 STEP = 1e-4  # of the central differences, relative to a coordinate's typical step
 LEAST_ROTOR = 1e-7  # kg m^2
 _UPPER = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
@@ -79,7 +79,7 @@ def nearest_links(base: BaseParameters, value: Array, std: Array, described: Arr
 
 
 def _links(x: Array) -> Array:
-    """Return links' parameters (links, 10) for coordinates (links, 10): log diagonal of U, then the elements above."""
+    """Return the parameters (links, 10) for coordinates (links, 10): log diagonal of U, then the elements above it."""
     U = np.zeros((len(x), 4, 4))
     U[:, np.arange(4), np.arange(4)] = np.exp(x[:, :4])
     for k, (row, column) in enumerate(_UPPER):

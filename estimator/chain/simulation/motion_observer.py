@@ -9,8 +9,8 @@ subtracted from the residual. An alarm is raised if the remainder exceeds `TIMES
 the largest planned torque for `HOLD_S`; large residuals raise it sooner.
 
 The noise estimate is updated only during motion: the residual of a joint at rest would widen the tolerance until
-nothing exceeded it. A joint at rest is also judged by the range of torques on it (`hil.estimator.models.standstill`). A
-residual that may become an alarm enters the noise estimate only after it has ended without an alarm.
+nothing exceeded it. A joint at rest is also assessed by the range of torques on it (`hil.estimator.models.standstill`).
+A residual that could lead to an alarm enters the noise estimate only once it has subsided without one.
 """
 
 import math
@@ -39,7 +39,7 @@ MOSTLY = 0.5  # filtered indicator of standstill, above which a joint counts as 
 STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
 VISIBLE_RAD_S = 0.027  # velocity that shows in the register
 CERTAIN = 2.0  # standard deviations within which a torque that friction has held is known
-VELOCITY_STD = 0.0135  # rad/s: resolution of the register and some noise
+VELOCITY_STD = 0.0135  # rad/s: resolution of the register, plus noise
 NOISE_S = 1.0
 CLIPPED = 9.0
 DRIFT, LEAST_DRIFT = 0.03, 1e-3
@@ -112,7 +112,7 @@ class ChainObserver:
             velocity: velocities [rad/s].
             torque: torques commanded since the previous sample [N m].
             seconds: time since the previous sample [s].
-            is_free: whether the motion of each joint can be judged; one value for all or one per joint.
+            is_free: whether the motion of each joint can be assessed; one value for all or one per joint.
             support: 1 or -1 for each joint that may rest against a stop that blocks motion in this direction, otherwise
                 0 (joints,); None if no joint does.
         """

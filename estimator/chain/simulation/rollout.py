@@ -1,9 +1,9 @@
 """Closed-loop simulation of an ensemble of chains under goal torques, as in an experiment.
 
-At each sample, a goal torque is added to the torque of a software spring and damper, which is computed from angles and
-velocities of the previous sample as in the real loop. In between, the motion is integrated by the linearly implicit
-Euler method, with the slope of friction at the old velocity. The feedback at every sample keeps the errors of this
-first-order method small.
+At each sample, a goal torque is added to the torque of a software spring and damper, which is computed from the angles
+and velocities of the previous sample, as in the real loop. In between, the motion is integrated by the linearly
+implicit Euler method, with the slope of friction at the old velocity. The feedback at every sample keeps the errors of
+this first-order method small.
 """
 
 import math
@@ -74,9 +74,9 @@ class Loop:
     pose: rest pose (joints,) [rad], in which a surface keeps gravity from moving joints further down.
     limit: largest commanded torque (joints,) [N m].
     stops: side on which each joint rests against its own stop in the rest pose (joints,): -1, 1, or 0 for none; None if
-    no joint does. A stop supports its joint instead of the surface, whatever the angles of the other joints. Nothing
-    supports a joint whose largest torque is 0.
-    pull: added to the spring and damper; None if they act alone.
+    no joint does. Such a joint is supported by its stop, not by the surface, whatever the angles of the other joints.
+    Nothing supports a joint whose largest torque is 0.
+    pull: torque added to that of the spring and damper; None if they act alone.
     """
 
     rate: float
@@ -93,8 +93,8 @@ class Loop:
 class Pull:
     """Torque that grows while a joint is off its path, so that friction and unknown weights do not hold it there.
 
-    path: positions (samples, joints) [rad]. per_second: growth relative to the spring's torque [1/s]. share: largest
-    value, as a fraction of the joint's largest torque.
+    path: positions (samples, joints) [rad]. per_second: growth relative to the spring's torque [1/s]. share: maximum of
+    this torque, as a fraction of the joint's largest torque.
     """
 
     path: Array
@@ -144,7 +144,7 @@ def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = No
 
 
 def _pull_of(loop: Loop) -> tuple[Array, Array, Array]:
-    """Return path (samples, joints), empty if none; growth per sample and rad (joints,); largest torque (joints,)."""
+    """Return the path (samples, joints), empty if none; growth per sample and rad (joints,); maximum (joints,)."""
     if loop.pull is None:
         return np.empty((0, len(loop.limit))), np.zeros_like(loop.limit), np.zeros_like(loop.limit)
     return loop.pull.path, loop.pull.per_second / loop.rate * loop.stiffness, loop.pull.share * loop.limit

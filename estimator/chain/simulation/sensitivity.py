@@ -21,7 +21,7 @@ LINE = 8  # numbers in a cache line
 
 @dataclass(frozen=True)
 class ChainRun:
-    """Input of a simulation from a recording: consecutive samples, each with its integration steps."""
+    """Input of a simulation, taken from a recording: consecutive samples, each with its integration steps."""
 
     torque: Array
     """Mean motor torque over each step after each sample, not yet multiplied by the torque scales (samples, steps,

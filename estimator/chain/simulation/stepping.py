@@ -1,4 +1,4 @@
-"""Compiled simulation of a chain under given motor torques, with derivatives (parameters, initial state).
+"""Compiled simulation of a chain under given motor torques, with derivatives.
 
 Friction and drive are modelled as in `hil.estimator.simulation.arm`. Each step uses that module's Rosenbrock method
 ROS2, with the second stage written so that both stages need the regressor at one acceleration only. With f the torques
@@ -69,8 +69,8 @@ def _direct(
     respect to v go to `by`.
 
     left: see `_left`. slopes: derivatives of the torque with respect to delay and each joint's lag. times: columns of
-    the delay, lag and lag ratio of each joint. late: derivatives of a joint's lag with respect to the latter two. ghk:
-    gamma h times the stage's acceleration.
+    the delay, lag and lag ratio of each joint. late: derivatives of each joint's lag with respect to joint 1's lag and
+    the joint's ratio. ghk: gamma h times the stage's acceleration.
     """
     scale, width, fading = p[SCALE, j], p[WIDTH, j], p[FADING, j]
     motor = scale * t
@@ -81,7 +81,7 @@ def _direct(
     bent = (1.0 - bend * bend) / width
     level_v = -2.0 * coulomb * rise * bump * v / (fading * fading)
     bent_v = -2.0 * bend * bent / width
-    # The equation is ID - left + ghk slope = 0; each entry: the decrease of `left` plus ghk times the slope's increase.
+    # The equation is ID - left + ghk slope = 0; each entry: the decrease in `left` plus ghk times the slope's increase.
     by[j] = p[VISCOUS, j] + level_v * bend + level * bent + ghk * (level_v * bent + level * bent_v)
     shape = bend + ghk * bent
     row[at[VISCOUS, j]] = v + ghk
@@ -243,8 +243,8 @@ def _broken(p: Any, v: Any, k: Any, t: Any, solve: Any, step: float, most: int) 
     """Return the number of smaller steps, at most `most`, that replace an undivided one after its first stage.
 
     `_pieces` cannot predict that a joint breaks away from standstill. Friction at the end of the stage then differs
-    from the tangent that the stage assumed; the velocity error that this difference causes may reach CROSSED widths. k:
-    accelerations of the stage. t: motor torques. solve: as `_stage` left it.
+    from the tangent that the stage assumed; the velocity error that this difference causes is limited to CROSSED
+    widths. k: accelerations of the stage. t: motor torques. solve: as `_stage` left it.
     """
     left, inverse = solve[0], solve[2]
     gh = GAMMA * step
