@@ -67,7 +67,7 @@ class Guard:
     recent: the exchanges so far, if another guard has checked them.
 
     lowers_since: for an arm that is being lowered, the time of the last exchange that all servos answered [s]. Replies
-    may then be missing for longer; temperatures, voltages and alerts are accepted as long as the servos have their
+    may then be missing for longer; temperatures, voltages and alerts are accepted as long as the servos keep their
     torque, and no advice about the experiment's torque is given.
 
     noise: noise of each joint's current readings [A or V], if another guard has measured it.
@@ -187,7 +187,7 @@ class Guard:
         """Check an exchange with missing replies or with errors in replies, or one that follows such an exchange."""
         now, missing, error = state.time_before_write, state.missing, state.error
         self._silence.ask(now)
-        # While the arm is lowered, an exchange may be awaited for a good part of the time that is allowed.
+        # While the arm is being lowered, an exchange may be awaited for a good part of the time that is allowed.
         silent = state.time_after_read if self._is_lowering else now
         for index in range(len(missing)):
             if error[index] & ALERT and not self._is_lowering:
@@ -233,14 +233,16 @@ class Guard:
         self._stop(index, *TORQUE_LOST)
 
     def rests_at(self, positions: Sequence[float]) -> None:
-        """Set the joints' angles from before torque was switched on [rad], by default those of the first sample.
+        """Set the joints' angles before torque was switched on [rad]; by default, those of the first sample are used.
         From now on, `measure_noise` is called with each exchange until `noise_is_known`.
         """
         self._resting = positions
         self._noise.begin()
 
     def measure_noise(self, state: State) -> None:
-        """Process an exchange of an arm at rest: until its noise is known, a current reading may deviate."""
+        """Process an exchange of an arm at rest: until its noise is known, any deviation of a current reading is
+        accepted.
+        """
         self._noise.add(state)
 
     def noise_is_known(self) -> list[str]:
@@ -366,7 +368,7 @@ class Guard:
                 self._stop(index, *wrong)
 
     def watchdog_reads(self, index: int, ticks: int) -> None:
-        """Raise SafetyStop for a joint whose Bus Watchdog reads `ticks` [20 ms] if one is required and not as armed."""
+        """Raise SafetyStop for a joint whose Bus Watchdog reads `ticks` [20 ms] if that is not the value required."""
         if (wrong := self._status.look_at_watchdog(ticks)) is not None:
             self._stop(index, *wrong)
 

@@ -125,7 +125,9 @@ def run_experiment(
 
 @contextmanager
 def _with_torque(torque: str) -> Iterator[None]:
-    """Append the torque state to an error in closing the recording, or to a stop request made while torque is cut."""
+    """Append the torque state to an error raised while closing the recording, or to a stop request made while torque is
+    cut.
+    """
     try:
         yield
     except (RunFolderError, StopRequested) as error:
@@ -261,7 +263,8 @@ def _check_unchanged(bus: ServoBus) -> Settings:
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, modes_seen_ago: float) -> None:
     """Name settings that another program changed. They are read only once torque is off, because reading takes time.
 
-    Changes that can explain a stop are named before its message; others, including any that may be later, after it.
+    Changes that can explain a stop are named before its message; others, including those that may have been made after
+    the stop, are named after it.
     """
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return
@@ -351,7 +354,8 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:
-    """Check that the arm is in its rest pose; if it is not, zero_ticks, direction or the arm is not as described.
+    """Check that the arm is in its rest pose; if it is not, zero_ticks, direction or the description of the arm is
+    wrong.
 
     After a run that passed this check, friction may hold the arm at up to twice the tolerance.
     """

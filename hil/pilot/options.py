@@ -51,11 +51,13 @@ class PilotOptions:
     friction.
     """
     worthwhile_raise: float = 1.15
-    """Minimum ratio of the new torque to the last run's that justifies another run if little of the range is unused."""
+    """Minimum ratio of the new torque to the last run's that justifies another run if every typical peak is above
+    `fair_share`.
+    """
     worthwhile_raise_far: float = 1.03
-    """Minimum ratio of the new torque to the last run's that justifies another run if more of the range is unused."""
+    """The same ratio if a typical peak of any joint is at most `fair_share`."""
     fair_share: float = 0.7
-    """If a typical arm reaches more than this fraction of a limit, little of the range counts as unused."""
+    """Fraction of a limit that decides between `worthwhile_raise` and `worthwhile_raise_far`."""
 
     wide_range: float = 0.74
     """Other waves are tried if a joint uses less than this fraction of its position range."""

@@ -120,7 +120,7 @@ class WayDown:
     def _is_silent_too_long(self, latest: State, whole: State) -> bool:
         """Whether replies have been missing for longer than lowering can do without them.
 
-        At most one packet is sent to find out, since each one feeds the watchdog of a servo that has another ID now.
+        At most one packet is sent to find out, since each one feeds the watchdog of a servo that now has another ID.
         """
         since = self._clock.now() - whole.time_before_write
         if since <= BRIDGED_ALONE_S or since > BRIDGED_S:
