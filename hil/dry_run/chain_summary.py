@@ -24,10 +24,9 @@ class ChainDryRun:
 
     config: configuration with the path and stabiliser that would be used. share: fraction of the designed path's
     amplitude; 1 if [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of
-    links with parts that are closer than the margin in nearly every pose and are therefore not checked. refused: why
-    the pilot has no safe first step; "" if it has one, None without a pilot. The pilot's decision overrides the
-    prediction. on_stops: sentence that names the joints assumed to rest on their own mechanical stops; "" if there are
-    none.
+    links with parts that are closer than the margin in nearly every pose and thus not checked. refused: why the pilot
+    has no safe first step; "" if it has one, None without a pilot. The pilot's decision overrides the prediction.
+    on_stops: sentence that names the joints assumed to rest on their own mechanical stops; "" if there are none.
     """
 
     config: Config

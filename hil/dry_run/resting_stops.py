@@ -77,9 +77,7 @@ def said_of_stops(config: Config, side: Array) -> str:
 
 
 def _ends(config: Config, rest: Array) -> tuple[Array, Array]:
-    """Distance on each side of the rest pose to the end of the range, configured or described, whichever is nearer
-    (joints,).
-    """
+    """Distance on each side from the rest pose to the nearer of the configured and the described limit (joints,)."""
     limits = np.array([joint.position_limit for joint in config.joints])
     ends = np.abs(limits - rest[:, None])
     for row, joint, at in zip(ends, described_arm(config).joints, rest, strict=True):

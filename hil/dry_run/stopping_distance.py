@@ -46,7 +46,7 @@ _IMMOVABLE = 1e3  # kg m^2
 _JUDGED_AFTER_S = (0.05, 0.2, 0.5)
 """Times after torque is cut at which a simulation ends if the arm has too little energy to exceed its limits [s]."""
 _REACTION = 2
-"""Samples until the stop takes effect: the sample that shows the fault, and the one in progress."""
+"""Number of samples before the stop takes effect: the sample that shows the fault, and the one in progress."""
 
 
 class Way(StrEnum):

@@ -55,7 +55,7 @@ log = logging.getLogger(__name__)
 def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledResult:
     """Estimate from the recording in `run`, write its result.json and return the result.
 
-    executor: used to start the fits that `friction = "auto"` may need ahead of time. Raises HilError, EstimationError.
+    executor: starts in advance the fits that `friction = "auto"` may need. Raises HilError, EstimationError.
     """
     config, facts = run.load_config(), run.load_facts()
     if config.is_chain:

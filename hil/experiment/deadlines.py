@@ -23,7 +23,7 @@ class Deadlines:
     """Counts missed deadlines of the samples. Every method may raise SafetyStop.
 
     heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did. any_share:
-    whether to tolerate any fraction of missed deadlines: while an arm is being lowered, only the time without a command
+    whether to ignore the fraction of missed deadlines: while an arm is being lowered, only the time without a command
     matters.
     """
 
@@ -36,8 +36,8 @@ class Deadlines:
         self._often = 0.0
         self._heard_instead = heard_instead
         self._counted = self._waited = 0
-        """Number of missed deadlines that `_often` counts, and how many of these were missed while waiting for a reply
-        that never came.
+        """Missed deadlines that `_often` counts, and how many of them were missed while waiting for a reply that never
+        came.
         """
         self.any_missed = False
         """Whether some deadlines have been missed recently, i.e. are not yet offset by deadlines met since."""

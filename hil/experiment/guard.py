@@ -36,8 +36,7 @@ from hil.plan.recent_motion import RecentMotion
 __all__ = ["MOST_OUTSIDE_RAD", "Guard"]
 
 JUMP_FACTOR = 1.5
-"""Ratio of the distance that a joint may appear to move between two samples to the distance its velocity limit allows.
-"""
+"""Distance that a joint may appear to move between two samples, relative to the one its velocity limit allows."""
 
 EARLY_MOTION_RAD = 0.05
 """Largest motion allowed while the arm rests before the start [rad]."""

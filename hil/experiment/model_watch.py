@@ -52,7 +52,7 @@ _INERTIA = 0.3
 
 Gravity may be ten times as large as a small first torque, which then moves the arm by a tenth of a radian. But viscous
 friction and inertia cannot be several times as large as the planned torque, because the arm would then hardly move. If
-the excitation is slower than `_USUAL_HZ`, they can, in proportion to its slowness: long, heavy arms are excited slowly.
+the excitation is slower than `_USUAL_HZ`, they can, proportionally: long, heavy arms are excited slowly.
 """
 _USUAL_HZ = 0.7
 """Geometric mean of the lowest and highest frequencies below which the excitation counts as slow."""

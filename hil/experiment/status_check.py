@@ -36,7 +36,7 @@ _REMEMBERED = 256
 """Number of latest goals kept."""
 
 _HELD_BEFORE = 4
-"""If writes are lost, a servo may also hold one of this many goals that were sent before the latest matching status."""
+"""If writes are lost, a servo may also hold one of the last `_HELD_BEFORE` goals before the latest matching status."""
 
 
 OLD_REPLIES = (
@@ -81,7 +81,7 @@ class StatusCheck:
         self._missed_at = [-1] * len(config.joints)
         """Number of goals that had been sent when a status last differed, by joint."""
         self._ticks = [(-1.0, 0.0)] * len(config.joints)
-        """Readings of the servo's and the computer's clocks at the latest status [s], by joint."""
+        """Servo's and computer's clock readings in the latest status [s], by joint."""
         self._foreign = [ForeignValues() for _ in config.joints]
         """Goals in the status that this program never sent, by joint."""
         # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
@@ -179,9 +179,9 @@ class StatusCheck:
         return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {self.why_lost()}"
 
     def _late(self, joint: int, held: float, former: float, ago: int) -> int:
-        """Number of cycles by which a servo's replies are late, inferred from `held`: a goal that had been sent, but
-        was not held, when its status last differed, `ago` cycles earlier. 0 if they need not be late. former: the goal
-        held then [A or V].
+        """By how many cycles a servo's replies are late, given that it holds a goal that had been sent, but was not
+        held, when its status last differed, `ago` cycles before; 0 if they need not be late. former: the goal held then
+        [A or V].
         """
         half = self._half_tick[joint]
         for cycles, goals in enumerate(reversed(self._goals)):
@@ -191,7 +191,7 @@ class StatusCheck:
         return 0
 
     def why_lost(self) -> str:
-        """Return why goals are lost: for example, because unexpected bytes on the wire collide with them."""
+        """Return why goals are lost, for example to unexpected bytes on the wire."""
         refused = (
             "Goals are being lost in transit, the servo refuses them (check its cable and limits), or a device on the "
             "bus repeats its old replies."
@@ -256,7 +256,7 @@ class StatusCheck:
 
 
 def _unlike_armed(longer: int) -> str:
-    """What a changed watchdog timeout means; longer: increase of the timeout [20 ms], 0 if the watchdog is off."""
+    """What a changed watchdog timeout means; longer: its increase [20 ms], 0 if it is off."""
     if not longer:
         return "is no longer protected"
     return f"stops by itself {'later' if longer > 0 else 'earlier'} than intended"

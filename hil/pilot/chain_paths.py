@@ -39,7 +39,7 @@ class Reserve:
     clearance: float = 0.01
 
     def larger(self, shortage: float) -> "Reserve":
-        """Return a larger reserve. shortage: shortfall of the predicted clearance [m], 0 if there is none."""
+        """Return a larger reserve. shortage: shortfall of the predicted clearance [m], or 0."""
         position = min(MORE * self.position, MOST_POSITION)
         return Reserve(position, self.speed / MORE, self.torque / MORE, self.clearance + shortage)
 

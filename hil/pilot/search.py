@@ -387,9 +387,7 @@ def _from_anywhere(config: Config) -> Config:
 
 
 def _within_limits(config: Config, pose: Array, inside: float) -> Array:
-    """Move a pose beyond the limits, where a stopped run left the arm, to within them: the next run begins by moving
-    inwards.
-    """
+    """Clip a pose in which a stopped run left the arm beyond its limits: the next run begins by moving inwards."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     return np.asarray(np.clip(pose, middle - inside * half, middle + inside * half))

@@ -199,8 +199,8 @@ def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
 
 
 def _ways(config: Config, path: Path) -> tuple[Path, Path]:
-    """Transitions from the rest pose into the moving path and back; each joint stays between its angles in the rest
-    pose and on the path.
+    """Transitions from the rest pose into the moving path and back; each joint stays between its rest angle and the
+    path.
     """
     count = max(2, round(config.experiment.ramp * config.experiment.rate))
     samples = path.position.shape[1]

@@ -30,10 +30,10 @@ above the first limit, the joint as pushed up to the second; in between, it is t
 """
 
 MOST_TURNED = 3.0
-"""Ratio of the two drops above which the unexplained torque did not come from the joint's motor alone."""
+"""Ratio of drops, as in `TURNED`, above which the unexplained torque did not come from the joint's motor alone."""
 
 UNEVEN = 0.3
-"""Deviation from a drop in proportion to the joint's own torque, relative to the whole drop, above which the
+"""Deviation from a drop in proportion to the joint's own torque, relative to the total drop, above which the
 unexplained torque has another cause.
 """
 

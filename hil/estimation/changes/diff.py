@@ -1,6 +1,6 @@
 """Comparison of two identifications of one arm: which parameters changed significantly.
 
-Every common parameter is tested individually, and each joint's friction is also tested as a whole
+Every common parameter is tested individually, and each joint's friction also as a whole
 (hil.estimation.changes.friction_change). Holm's step-down correction keeps the probability of any false alarm in the
 whole table at `FALSE_ALARMS` (S. Holm, Scandinavian Journal of Statistics 6 (1979) 65). A change must also be larger
 than the fraction `least_share` of the parameter's magnitude, since standard errors cover noise only.
@@ -56,8 +56,7 @@ class Difference:
     """The changes from one run to another.
 
     only_before, only_after: terms that only one of the two models has. detectable: smallest change of each friction
-    term that two runs like these would reveal with a probability of 95 % if no other term changed [% of its earlier
-    value].
+    term alone that two such runs would reveal with a probability of 95 % [% of its earlier value].
     """
 
     before: str
@@ -68,7 +67,7 @@ class Difference:
     detectable: Mapping[str, float] = field(default_factory=dict)
     trust: tuple[str | None, str | None] = (None, None)
     other_joints: tuple[str, ...] = ()
-    """Warnings: a sentence per joint whose description differs between the runs, and one if both runs are the same."""
+    """Warnings: one sentence per joint that the runs describe differently, and one if a run is compared with itself."""
 
     @property
     def changed(self) -> tuple[Change, ...]:
@@ -141,7 +140,7 @@ def diff_models(
     least_share: float = LEAST_SHARE,
     friction: Sequence[FrictionChange] = (),
 ) -> Difference:
-    """Compare two models of one arm parameter by parameter, in the order of the first model."""
+    """Compare two models of one arm parameter by parameter, in the order of the first."""
     periods = ("ripple_cycles", "cogging_cycles")
     common = [name for name in before.values if name in after.values and not name.startswith(periods)]
     z = {name: _z(before, after, name) for name in common}

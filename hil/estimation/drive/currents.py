@@ -44,8 +44,8 @@ _FEWEST_AT_REST = 30
 """Minimum number of consecutive readings at one goal from which their noise is measured."""
 
 _SMALL, _LEAST = 0.5, 0.1
-"""Upper and lower bound on goals that are too small to be clipped but large enough to evaluate, relative to the largest
-measured current.
+"""Highest and lowest goals that cannot be clipped but are large enough to evaluate, relative to the largest measured
+current.
 """
 
 
@@ -98,9 +98,8 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
 
 
 def _noise(goal: Array, measured: Array) -> float:
-    """Standard deviation of a current reading, estimated from the recording: its scatter at constant goals or, if that
-    is larger, the smaller of the estimates from its deviation from the goals and from the second difference of that
-    deviation.
+    """Standard deviation of a current reading, estimated from the recording: its scatter at constant goals or, if
+    larger, its deviation from the goals or (if smaller) the second difference of that deviation.
 
     The current may lag the goal by a few samples: the lag that leaves the smallest deviation is used.
     """
@@ -171,7 +170,7 @@ def _least(goal: Array) -> Array:
 
 
 def _short_part(goal: Array, measured: Array, margin: float) -> float:
-    """Fraction of the samples with large goals whose current is too small."""
+    """Among the samples with large goals, the fraction whose current is too small."""
     least = _least(goal)
     large = (least > LARGE * np.abs(goal).max()) & np.isfinite(measured[1:])
     if not large.any():

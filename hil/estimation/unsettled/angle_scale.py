@@ -1,5 +1,4 @@
-"""Detection of angles with a wrong scale: an encoder resolution, a belt ratio or a gear ratio other than the stated
-one.
+"""Detection of angles with a wrong scale: an encoder resolution, belt ratio or gear ratio other than the stated one.
 
 A joint's equation is linear in its angle except for gravity, so only gravity reveals the scale. Near the angle at which
 the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, a weaker gravity and a spring: with a
@@ -32,7 +31,7 @@ RESTS = 0.2  # largest torque of the spring where the joint would hang, relative
 class _Scale:
     """Angles of joint 1 that seem to be `factor` times the true ones.
 
-    by_zero: whether `factor` was inferred from the encoder zero and agrees with the spring.
+    by_zero: whether this factor was inferred from the encoder zero.
     """
 
     factor: float

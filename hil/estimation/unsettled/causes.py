@@ -55,7 +55,7 @@ def causes(fitted: Fitted) -> tuple[str, ...]:
 
 
 def are_known(fitted: Fitted, found: tuple[str, ...]) -> bool:
-    """Whether `found`, from `causes`, names a cause, not merely the places where the residual is large."""
+    """Whether `found`, from `causes`, names a cause, not just places where the residual is large."""
     where = fitted.recordings, fitted.names, fitted.predicted, fitted.estimate.segment_length
     return bool(found) and found != local_residual(*where)
 

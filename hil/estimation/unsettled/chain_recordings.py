@@ -145,8 +145,7 @@ def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescripti
 def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior, contradictory: bool) -> RecordedChain:
     """The fit. contradictory: whether the torques seem to contradict each other.
 
-    If so, the ratios of the torques are fitted too, unless the fit finds that the torques agree; a regression does not
-    fit these ratios.
+    If so, their ratios are fitted too, unless the fit finds that the torques agree; a regression does not fit ratios.
     """
     if contradictory and all(each.between == "held" for each in recordings):
         found = identify_recordings(recordings, replace(model, torque_scale=True), prior)
@@ -269,7 +268,7 @@ def _verdict(
 
 
 def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: bool) -> tuple[str, tuple[str, ...]]:
-    """The best verdict that the prediction of the last part allows ("" for any), and the reasons."""
+    """The best verdict that the prediction of the last part allows ("" for any), and why."""
     if foretold is None:
         return "with care", (
             "The recordings are too short, or end too long after the motion, to check the prediction on a part that "

@@ -1,4 +1,4 @@
-"""Location and kind of the parts of a recording that the fitted model does not explain although it explains the rest.
+"""Location and kind of the parts of a recording that the fitted model fails to explain, unlike the rest.
 
 These are frozen readings, missing torques, single wrong samples, and stops.
 """

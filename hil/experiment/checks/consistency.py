@@ -162,11 +162,11 @@ MEMORY = np.dtype(
 position, velocity, turn: latest values, and latest change of velocity [rad, rad/s]; the position is NaN before the
 first one and after a long gap. seconds, moved, difference, unknown, most_curved: sums (for the last one, the maximum)
 since the long memory was last updated. seen: `difference` without motion that the velocity register cannot show.
-headed: time of motion in the positive direction minus that in the negative one since then [s]. rough: sum of squares of
-the errors that velocity jumps may cause in each interval since then [rad^2]. heading, roughness: the same two in the
-slow memory. moving: time in motion there [s]. learnt: information from which lag and scale error were estimated
-[rad^2/s]. lag, scale: their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the
-sums from which lag and scale error are estimated.
+headed: time of motion in the positive minus that in the negative direction since then [s]. rough: sum of squares of the
+errors that velocity jumps may cause in each interval since then [rad^2]. heading, roughness: the same two in the slow
+memory. moving: time in motion there [s]. learnt: information from which lag and scale error were estimated [rad^2/s].
+lag, scale: their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the sums from
+which lag and scale error are estimated.
 """
 
 
@@ -419,7 +419,7 @@ def _is_wrong(fading: Any, apart: float, unsure: float, velocity: float, lag: fl
 
 
 def _explained(fading: Any, unsure: float, velocity: float, lag: float, scale: float) -> tuple[float, float]:
-    """Return the difference accepted in either direction, and the signed amount that the largest lag adds [rad]."""
+    """Return the difference accepted in either direction, and the offset due to the largest lag [rad]."""
     allowed = unsure + scale * abs(fading.far) + fading.curved + fading.unknown + _LAG_SHARE * lag * fading.span
     return allowed, lag * (velocity - fading.mean)
 

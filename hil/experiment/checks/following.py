@@ -61,9 +61,7 @@ LEAST_RATIO = 10.0
 """Log likelihood ratio at which a current counts as zero, however low the rate."""
 
 NOISY_RATIO = 16.0
-"""`LEAST_RATIO` for a sensor whose noise is known to be as large as assumed; most sensors have far less noise than
-that.
-"""
+"""`LEAST_RATIO` for a sensor known to be as noisy as assumed; most sensors have far less noise than that."""
 
 _FEWEST = 2
 """Minimum number of samples that differ from the goal, however low the rate."""
@@ -101,8 +99,8 @@ MEMORY = np.dtype(
 
 per_square: 1 / (2 sigma^2). least_ratio: log likelihood ratio at which a current counts as zero. allowed: accepted
 deviation [A or V]; share: the same, relative to the goal; follow_time: how long a larger deviation may last [s].
-evidence, ratio, count: sums of the log likelihood ratios, weighted by time [s] and unweighted, and their number of
-samples. differs_for, differs: duration [s] and number of samples of a deviation.
+evidence, ratio, count: sums of the log likelihood ratios, weighted by time [s] and unweighted, and their number.
+differs_for, differs: duration [s] and number of samples of a deviation.
 """
 
 

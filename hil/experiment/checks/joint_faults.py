@@ -21,9 +21,7 @@ limit.
 """
 
 _LACKS_S, _EXPLAINED = 0.1, 0.5
-"""The supply explains missing torque if, within the last `_LACKS_S` [s], it caused at least the fraction `_EXPLAINED`
-of it.
-"""
+"""The supply explains missing torque if it caused at least `_EXPLAINED` of it within the last `_LACKS_S` [s]."""
 
 _FEWEST = 4
 """Minimum number of readings from which to explain how a current differs from its goal."""

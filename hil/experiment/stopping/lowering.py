@@ -46,9 +46,7 @@ that exceeds this and still speeds up although its torque opposes the motion cou
 """
 
 TOO_FAST = 0.6
-"""Velocity of a joint that does not seem to obey its motor, relative to its limit, above which torque is cut without a
-test.
-"""
+"""Velocity, relative to the limit, above which torque is cut without a test if a joint seems not to obey its motor."""
 
 _GROWS_S = 0.015
 _ROOM_RAD = 0.2  # beyond the position limits and the path home

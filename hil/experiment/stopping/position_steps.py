@@ -14,8 +14,7 @@ STEP_RAD = 0.04
 """Smallest step [rad]; smaller ones are left to the feedback."""
 
 BENDS_RAD_S2 = 200.0
-"""Largest joint acceleration assumed while an arm is being lowered [rad/s^2]; it determines the uncertainty of
-predictions.
+"""Largest joint acceleration assumed while an arm is being lowered [rad/s^2]; it sets the uncertainty of predictions.
 """
 
 MOST_STEPS = 6
