@@ -60,7 +60,7 @@ class ChainDryRun:
         return self.doubt(config) if self.refused is None else self.refused
 
     def doubt(self, config: Config) -> str:
-        """Explain which of the simulated arms would not move or stop safely; "" if all would."""
+        """Explain why simulated arms would move or stop unsafely; "" if none would."""
         return unsafe(config, self.foreseen) or ("" if config.safety.stop == "cut" else self.stops.unsafe)
 
 

@@ -276,7 +276,7 @@ class Guard:
                 )
 
     def _else_moved(self, velocity: float) -> str:
-        """Return what may have moved a joint before the start if it is not swinging; velocity: its velocity [rad/s]."""
+        """Return what, other than swinging, may have moved a joint before the start; velocity: its velocity [rad/s]."""
         if abs(velocity) < self._safety.rest_velocity:
             return (
                 f"Otherwise, since it is not moving now ({velocity:+.2f} rad/s), check its encoder and magnet, and "

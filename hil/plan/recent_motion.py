@@ -19,7 +19,8 @@ from hil.drivers.state import State
 __all__ = ["RecentMotion", "Travel"]
 
 SHORT_S, LONG_S = 0.004, 0.02
-"""The two spans over which motion is judged [s]; each reaches back to the latest exchange that is at least that old."""
+"""The two spans over which motion is evaluated [s]; each reaches back to the latest exchange that is at least that old.
+"""
 
 _OLDEST_S = 0.05
 _LONGER = 1.5
