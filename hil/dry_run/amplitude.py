@@ -39,8 +39,8 @@ class AmplitudeOptions:
     max_ratio: float = 2.0
     """Maximum ratio of the torques of two successive iterations."""
     damping: float = 0.85
-    """Each iteration scales the torque by a power of the ratio of desired to reached peaks; the exponent is then
-    multiplied by this factor.
+    """Each iteration scales the torque by a power of the ratio of desired to reached peaks; the exponent is multiplied
+    by this factor after each iteration.
     """
     min_exponent: float = 0.4
     least_change: float = 0.005

@@ -31,10 +31,10 @@ RAN_AWAY = 1e3
 class ChainPrediction:
     """Prediction of a spatial arm's experiment.
 
-    peaks: predicted peaks and their limits. nearest: smallest clearance among all arms, which occurs
-    `moment` [s] into the segment `role`.
-    rooms: smallest clearance of each arm minus the required one (arms,) [m]. tracking: median of the arms' largest
-    tracking errors (joints,) [rad]. ways: number of samples of the transition at either end of the first segment.
+    peaks: predicted peaks and their limits. nearest: smallest clearance among all arms, which occurs `moment` [s] into
+    the segment `role`. rooms: smallest clearance of each arm minus the required one (arms,) [m]. tracking: median of
+    the arms' largest tracking errors (joints,) [rad]. ways: number of samples of the transition at either end of the
+    first segment.
     """
 
     peaks: Prediction

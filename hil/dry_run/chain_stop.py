@@ -49,7 +49,7 @@ class LoweringForeseen:
     """Prediction of how a stop lowers the arm.
 
     seconds: longest duration [s]. nearest: smallest clearance. lies: fraction of simulations that end in the rest pose.
-    joint: name of the joint that ends farthest from its rest angle, by `away` [rad]. helps: remedy for it.
+    joint: name of the joint that ends farthest from its rest angle, by `away` [rad]. helps: a remedy.
     """
 
     seconds: float
@@ -95,8 +95,8 @@ def foreseen_stops(
 ) -> ChainStops:
     """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError.
 
-    tell: called with the number of simulations done and the total number. passed: whether each joint has
-    ever been below and above its rest pose (2, joints), as for `resting_stops`.
+    tell: called with the number of simulations done and the total number. passed: whether each joint has ever been
+    below and above its rest pose (2, joints), as for `resting_stops`.
     """
     segment = plan.segments[0]
     assert isinstance(segment, PathSegment)

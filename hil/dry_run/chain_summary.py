@@ -24,7 +24,7 @@ class ChainDryRun:
 
     config: configuration with the path and stabiliser that would be used. share: fraction of the designed path's
     amplitude; 1 if [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of
-    links with parts that are closer than the margin in nearly every pose and are not checked. refused: why the pilot
+    links with parts that are closer than the margin in nearly every pose and thus not checked. refused: why the pilot
     has no safe first step; "" if it has one, None without a pilot. The pilot's decision overrides the prediction.
     on_stops: sentence that names the joints assumed to rest on their own mechanical stops; "" if there are none.
     """
@@ -60,7 +60,7 @@ class ChainDryRun:
         return self.doubt(config) if self.refused is None else self.refused
 
     def doubt(self, config: Config) -> str:
-        """Explain which of the simulated arms would not move or stop safely; "" if all would."""
+        """Explain why simulated arms would move or stop unsafely; "" if none would."""
         return unsafe(config, self.foreseen) or ("" if config.safety.stop == "cut" else self.stops.unsafe)
 
 

@@ -29,10 +29,10 @@ def resting_stops(config: Config, arms: ChainArms, planned: Sequence[Array] = ()
     """Side on which each joint lies on its stop (joints,): -1 at its smallest angle, 1 at its largest, 0 if on neither.
 
     A joint is assumed to lie on its stop if its rest pose is near the end of its range, nothing else touches the part
-    of the arm that it moves, and gravity does not pull it away from there. This assumption ends when a recording shows
-    the joint beyond its rest pose, or a planned path takes it there, within its configured limits. planned: positions
-    of these paths, each (joints, samples) [rad]. passed: whether each joint has been below and above its rest pose, as
-    returned by `passed_rest` (2, joints). Raises ArmFileError.
+    of the arm that it moves, and gravity does not pull it away from there. This assumption is dropped if a recording
+    shows the joint beyond its rest pose, or a planned path takes it there, within its configured limits. planned:
+    positions of these paths, each (joints, samples) [rad]. passed: whether each joint has been below and above its rest
+    pose, as returned by `passed_rest` (2, joints). Raises ArmFileError.
     """
     rest = np.array(config.arm.rest_pose)
     low, high = _ends(config, rest)
@@ -77,7 +77,7 @@ def said_of_stops(config: Config, side: Array) -> str:
 
 
 def _ends(config: Config, rest: Array) -> tuple[Array, Array]:
-    """Distance of the rest pose from the nearer end of the range, configured or described, on each side (joints,)."""
+    """Distance on each side from the rest pose to the nearer of the configured and the described limit (joints,)."""
     limits = np.array([joint.position_limit for joint in config.joints])
     ends = np.abs(limits - rest[:, None])
     for row, joint, at in zip(ends, described_arm(config).joints, rest, strict=True):

@@ -48,6 +48,6 @@ def dry_run(
 def ensemble_of(config: Config, result: Path | None, arms: int) -> Ensemble:
     """Draw an ensemble from the earlier result, or from the prior if `result` is None.
 
-    Raises ConfigError, also if the result is for another arm, and ResultError.
+    Raises ConfigError (also if the result is for another arm) and ResultError.
     """
     return prior_ensemble(config, arms) if result is None else result_ensemble(earlier_result(config, result), arms)

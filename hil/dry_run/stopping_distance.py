@@ -44,9 +44,9 @@ overshoot.
 _EVENLY = 16
 _IMMOVABLE = 1e3  # kg m^2
 _JUDGED_AFTER_S = (0.05, 0.2, 0.5)
-"""Times after torque is cut at which a simulation ends if the arm has too little energy to leave its limits [s]."""
+"""Times after torque is cut at which a simulation ends if the arm has too little energy to exceed its limits [s]."""
 _REACTION = 2
-"""Samples until the stop takes effect: the sample that shows the fault, and the one in progress."""
+"""Number of samples before the stop takes effect: the sample that shows the fault, and the one in progress."""
 
 
 class Way(StrEnum):
@@ -274,7 +274,7 @@ class _Stops:
     def _moved(
         self, arm: Simulator, limits: Boundary, scale: Array, state: Array, pieces: list[_Piece]
     ) -> Iterator[Response]:
-        """Yield the motion from `state`, piece by piece, as long as the arm may still leave its limits."""
+        """Yield the motion from `state`, piece by piece, until the arm can no longer exceed its limits."""
         for piece in pieces:
             command, feedback, count = piece
             off = piece is self._off

@@ -24,8 +24,8 @@ class FirstRun:
     """The first run of a pilot.
 
     peak_torque: peak torques (joints,) [N m]. prediction: peaks of the simulated arms, with the limits of that run.
-    played: its configuration. If the arm needs a stabiliser, it contains the proposed one; if no torque is safe in the
-    whole range, its position limits are closer to the rest pose.
+    played: its configuration. If the arm needs a stabiliser, it contains the proposed one; if no torque is safe over
+    the whole range, its position limits are closer to the rest pose.
     """
 
     peak_torque: Array

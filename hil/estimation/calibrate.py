@@ -44,8 +44,8 @@ class Estimated:
 class CalibrationFit:
     """Quality of the fit.
 
-    residual_rms_ticks: residuals of both runs in encoder steps RMS. misfit: weighted sum of squared residuals per
-    sample; 1 means noise alone. joints: number of joints. reached: whether the fit has reached its minimum.
+    residual_rms_ticks: RMS residual of both runs [encoder steps]. misfit: weighted sum of squared residuals per sample;
+    1 means noise alone. joints: number of joints. reached: whether the fit has reached its minimum.
     """
 
     residual_rms_ticks: tuple[PerJoint, ...]
@@ -71,7 +71,7 @@ class AddedMass:
     """The mass as specified by the user: `distance` and `length` for a planar arm, `at` and `joint` for a spatial one.
 
     mass [kg], inertia about its centre of mass [kg m^2]. distance: distance from the last joint [m]; length: length of
-    link 1 [m]. at: position in the frame of the link that `joint` moves, by default the last joint [m].
+    link 1 [m]. at: position [m] in the frame of the link that `joint` (by default the last joint) moves.
     """
 
     mass: float

@@ -15,7 +15,7 @@ from hil.runs.run_folder import RunFolder
 
 
 def link_of(config: Config, joint: str | None) -> int:
-    """Index of the joint that moves the link with the mass, from 0; by default the last one. Raises ConfigError."""
+    """Index, from 0, of the joint that moves the link with the mass; by default, the last joint. Raises ConfigError."""
     names = [each.name for each in config.joints]
     if joint is None:
         return len(names) - 1

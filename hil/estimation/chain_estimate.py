@@ -120,7 +120,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
 def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
     """The model requested by the configuration.
 
-    Ratios of torque constants are parameters if the configuration gives an uncertainty. Each joint has its own lag:
+    Ratios of torque constants are parameters if the configuration gives their uncertainty. Each joint has its own lag:
     servo models differ, and neglecting half a millisecond biases the inertias of light joints by several percent.
     """
     wanted = config.model
@@ -256,7 +256,7 @@ def contradicting_torques(config: Config, estimate: ChainEstimate) -> tuple[str,
 
 
 def about_zeros(config: Config, estimate: ChainEstimate) -> str:
-    """Say that encoder zeros were not fitted, and which ones the recording contradicts; "" if they were fitted."""
+    """State that encoder zeros were not fitted, and which ones the recording contradicts; "" if they were fitted."""
     if estimate.model.zeros or estimate.model.joints == 1:
         return ""
     held = "The encoder zeros were taken from the configuration and not identified"

@@ -2,8 +2,8 @@
 
 The estimator assumes that goals and positions are exchanged at the deadline; in fact both are slightly late. Therefore
 each angle is shifted by velocity times lateness, and each held torque is replaced by the mean torque between its
-deadline and the next: the previous goal acts until the write, the new one afterwards. The remaining error is of second
-order: half the acceleration times lateness squared, a hundredth of an encoder step at 0.5 ms and 50 rad/s^2.
+deadline and the next: the previous goal acts until the write, the new one afterwards. The remaining error is
+second-order: half the acceleration times the lateness squared, a hundredth of an encoder step at 0.5 ms and 50 rad/s^2.
 
 Delays that the host cannot see, in the adapter's buffer and before the servo's sampling, are not corrected.
 """
@@ -17,7 +17,7 @@ from hil.estimator.data.settled_period import SettledPeriod
 
 
 def lateness(rows: NDArray[np.void]) -> Array:
-    """Time from each row's deadline to its write [s], in the shape of `rows`; 0 if nothing was written."""
+    """Time from each row's deadline to its write [s], with the shape of `rows`; 0 if nothing was written."""
     deadline: Array = rows["deadline"]
     written: Array = rows["time_before_write"]
     read: Array = rows["time_after_read"]

@@ -27,7 +27,7 @@ def physical_of(result: Result, known: Mapping[str, Known], gravity: float) -> P
 
 
 def unit_of(name: str) -> str:
-    """SI unit of a quantity, by its name."""
+    """SI unit of the quantity with this name."""
     return QUANTITY_UNITS[name.rsplit("_", 1)[0]]
 
 

@@ -85,7 +85,7 @@ def arm_facts(config: Config) -> ArmFacts:
 
 
 def quantities(estimate: FittedParameters, start: int, end: int) -> dict[str, Quantity]:
-    """The parameters with these indices, by name."""
+    """The parameters from index `start` up to `end`, by name."""
     return {
         estimate.names[index]: Quantity(float(estimate.value[index]), float(estimate.std[index]), estimate.units[index])
         for index in range(start, end)

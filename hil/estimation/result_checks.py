@@ -79,7 +79,7 @@ def describe_choice(choice: trial.Choice) -> ModelChoice:
 
 
 def describe_segment_choice(choice: unsettled.SegmentChoice) -> ModelChoice:
-    """Convert the choice among models for unsettled data, judged on held-out segments, to the form stored in a
+    """Convert the choice among models for unsettled data, which is based on held-out segments, to the form stored in a
     result.
     """
     return ModelChoice(
@@ -90,7 +90,7 @@ def describe_segment_choice(choice: unsettled.SegmentChoice) -> ModelChoice:
 
 
 def describe_chain_choice(choice: ChainChoice) -> ModelChoice:
-    """Convert the choice among models of a spatial arm, judged by predicting the fitted motion one step ahead."""
+    """Convert the choice among models of a spatial arm, which is based on one-step predictions of the fitted motion."""
     return ModelChoice(
         chosen=choice.estimate.model.description,
         error_divided_by=choice.gained,

@@ -130,7 +130,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
 
 
 def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tuple[SettledPeriod | None, list[str]]:
-    """The settled period of the held-out multisine, if there is one, and a warning if the run was stopped before it."""
+    """The settled period of the held-out multisine, if there is one, and a warning if the run ended before it."""
     if HELD_OUT not in facts.segments:
         return None, []
     try:
@@ -154,8 +154,8 @@ def _torque_instead(other: SettledPeriod | None, estimate: Estimate, drift: Drif
 
 
 def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift | None, is_corrected: bool) -> PlayedPeriod:
-    """Predict the held-out period with the friction at that time. is_corrected: correct it for friction that changes
-    within the period, as was done for the fitted period.
+    """Predict the held-out period with the friction at that time. is_corrected: whether to correct the prediction for
+    friction that changes within the period, as was done for the fitted period.
     """
     if drift is None:
         return PlayedPeriod(other.rate, other.torque, other.position, predict_period(estimate, other))

@@ -21,7 +21,7 @@ from hil.runs.run_folder import RunFacts
 
 _AROUND_S, _FEWEST_AROUND = 0.04, 4
 """A sample's velocity is determined from the readings within this time [s] before and after it. Second value: minimum
-number of readings on either side.
+number of readings on each side.
 """
 
 
@@ -82,16 +82,16 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
 
 
 def _passes(position: Array, first: int, on_time: Array) -> tuple[Array, ...]:
-    """Second halves of the settled periods `on_time` (periods, joints, samples), and of the period before.
+    """Second halves of the settled periods `on_time` (periods, joints, samples), and of the period before them.
 
-    The first half of the period before may still contain a transient.
+    The first half of the latter may still contain a transient.
     """
     half = on_time.shape[2] // 2
     return position[first - 1, :, half:], *on_time[:, :, half:]
 
 
 def _mean_of_periods(position: Array) -> Array:
-    """Mean of (periods, joints, samples) over the periods, without missing values; NaN if all are missing."""
+    """Mean of (periods, joints, samples) over the periods, ignoring missing values; NaN if all are missing."""
     count = np.isfinite(position).sum(axis=0)
     mean: Array = np.where(count > 0, np.nansum(position, axis=0) / np.maximum(count, 1), np.nan)
     return mean

@@ -93,8 +93,8 @@ def contradictions(
     torque constants.
 
     joints: names. extra: terms of a result that include the ratios, if there are any. ratio_std: relative standard
-    deviation of the ratio of the torque constants, by parameter, where given; otherwise the spread among servos of one
-    model. known: contradictions that have their own sentences.
+    deviation of the ratio of the torque constants, by parameter; where it is not given, the spread among servos of one
+    model is assumed. known: contradictions that have their own sentences.
     """
     said = {each.name for each in known}
     found = []
@@ -116,7 +116,7 @@ def contradictions(
 def ratios_said(
     joints: Sequence[str], extra: Mapping[str, Quantity], source: Source, without: Sequence[str]
 ) -> tuple[str, ...]:
-    """A sentence about the ratios of the torques; () if the sentences in `without` give them."""
+    """A sentence about the ratios of the torques; () if the sentences in `without` already give them."""
     ratios = [(joint, ratio) for joint, _, ratio in _ratios(joints, extra)]
     if not ratios or without:
         return ()

@@ -43,7 +43,7 @@ def true_parameters(config: Config, time: float = math.inf) -> dict[str, float] 
 
 
 def back_emf(config: Config, fake: FakeArm, drives: Sequence[Drive]) -> dict[str, float]:
-    """Back-EMF of each voltage-driven joint as viscous friction [N m s/rad], by the name of the friction parameter."""
+    """Back-EMF of each voltage-driven joint as viscous friction [N m s/rad], by parameter name."""
     found: dict[str, float] = {}
     for servo, moved in zip(fake.servos, fake.joints, strict=True):
         if config.joints[moved].drive_mode is Mode.PWM:

@@ -23,7 +23,7 @@ class Deadlines:
     """Counts missed deadlines of the samples. Every method may raise SafetyStop.
 
     heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did. any_share:
-    whether any fraction of the deadlines may be missed. While an arm is lowered, only the time without a command
+    whether to ignore the fraction of missed deadlines: while an arm is being lowered, only the time without a command
     matters.
     """
 

@@ -36,8 +36,7 @@ from hil.plan.recent_motion import RecentMotion
 __all__ = ["MOST_OUTSIDE_RAD", "Guard"]
 
 JUMP_FACTOR = 1.5
-"""Ratio of the distance that a joint may appear to move between two samples to the distance its velocity limit allows.
-"""
+"""Distance that a joint may appear to move between two samples, relative to the one its velocity limit allows."""
 
 EARLY_MOTION_RAD = 0.05
 """Largest motion allowed while the arm rests before the start [rad]."""
@@ -67,7 +66,7 @@ class Guard:
     recent: the exchanges so far, if another guard has checked them.
 
     lowers_since: for an arm that is being lowered, the time of the last exchange that all servos answered [s]. Replies
-    may then be missing for longer; temperatures, voltages and alerts are accepted as long as the servos have their
+    may then be missing for longer; temperatures, voltages and alerts are accepted as long as the servos keep their
     torque, and no advice about the experiment's torque is given.
 
     noise: noise of each joint's current readings [A or V], if another guard has measured it.
@@ -187,7 +186,7 @@ class Guard:
         """Check an exchange with missing replies or with errors in replies, or one that follows such an exchange."""
         now, missing, error = state.time_before_write, state.missing, state.error
         self._silence.ask(now)
-        # While the arm is lowered, an exchange may be awaited for a good part of the time that is allowed.
+        # While the arm is being lowered, an exchange may be awaited for a good part of the time that is allowed.
         silent = state.time_after_read if self._is_lowering else now
         for index in range(len(missing)):
             if error[index] & ALERT and not self._is_lowering:
@@ -233,14 +232,16 @@ class Guard:
         self._stop(index, *TORQUE_LOST)
 
     def rests_at(self, positions: Sequence[float]) -> None:
-        """Set the joints' angles from before torque was switched on [rad], by default those of the first sample.
+        """Set the joints' angles before torque was switched on [rad]; by default, those of the first sample are used.
         From now on, `measure_noise` is called with each exchange until `noise_is_known`.
         """
         self._resting = positions
         self._noise.begin()
 
     def measure_noise(self, state: State) -> None:
-        """Process an exchange of an arm at rest: until its noise is known, a current reading may deviate."""
+        """Process an exchange of an arm at rest: until its noise is known, any deviation of a current reading is
+        accepted.
+        """
         self._noise.add(state)
 
     def noise_is_known(self) -> list[str]:
@@ -275,7 +276,7 @@ class Guard:
                 )
 
     def _else_moved(self, velocity: float) -> str:
-        """Return what may have moved a joint before the start if it is not swinging; velocity: its velocity [rad/s]."""
+        """Return what, other than swinging, may have moved a joint before the start; velocity: its velocity [rad/s]."""
         if abs(velocity) < self._safety.rest_velocity:
             return (
                 f"Otherwise, since it is not moving now ({velocity:+.2f} rad/s), check its encoder and magnet, and "
@@ -366,7 +367,7 @@ class Guard:
                 self._stop(index, *wrong)
 
     def watchdog_reads(self, index: int, ticks: int) -> None:
-        """Raise SafetyStop for a joint whose Bus Watchdog reads `ticks` [20 ms] if one is required and not as armed."""
+        """Raise SafetyStop for a joint whose Bus Watchdog reads `ticks` [20 ms] if that is not the value required."""
         if (wrong := self._status.look_at_watchdog(ticks)) is not None:
             self._stop(index, *wrong)
 

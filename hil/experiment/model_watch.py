@@ -52,7 +52,7 @@ _INERTIA = 0.3
 
 Gravity may be ten times as large as a small first torque, which then moves the arm by a tenth of a radian. But viscous
 friction and inertia cannot be several times as large as the planned torque, because the arm would then hardly move. If
-the excitation is slower than `_USUAL_HZ`, they can, in proportion: long, heavy arms are excited slowly.
+the excitation is slower than `_USUAL_HZ`, they can, proportionally: long, heavy arms are excited slowly.
 """
 _USUAL_HZ = 0.7
 """Geometric mean of the lowest and highest frequencies below which the excitation counts as slow."""
@@ -62,14 +62,14 @@ _NEAR_LIMIT = 0.05
 """Distance from a position limit, as a fraction of the range, within which a hard stop is named as a possible cause."""
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
-"""If a torque is held over several exchanges, a joint must appear stationary for this time before it is judged [s]."""
+"""If a torque is held over several exchanges, a joint must appear stationary for this time before it is checked [s]."""
 
 _LAG_S = 0.012
 """Time constant with which a torque step appears in the velocity [s]: current loop and velocity filter."""
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 JOLT_S, JOLT_BACK_S = 0.01, 0.15
-"""Times within which a slipping joint's velocity changes and returns [s]."""
+"""Times within which a slipping joint's velocity changes, and returns [s]."""
 
 JOLT_RAD_S, JOLT_TIMES = 1.2, 5.0
 """Smallest change of velocity in `JOLT_S` that counts as a jolt [rad/s], and its smallest ratio to the RMS of ordinary
@@ -83,7 +83,7 @@ allowance for the curvature of ordinary motion, as a fraction of the usual chang
 
 _USUAL_S = 1.0
 _GAP = 3.0
-"""Gap between two samples, in sample intervals, beyond which changes of velocity are not judged."""
+"""Gap between two samples, in sample intervals, beyond which changes of velocity are not checked."""
 _WINDOW_S = 0.3
 """Time span over which a message about a stationary joint gives the range of its torque [s]: a single value may be near
 zero.
@@ -157,11 +157,11 @@ _TIMES = np.dtype(
 )
 """Quantities that depend on the times of the samples.
 
-seen_at, seconds: time of the latest sample, and since the one before [s]; seconds is infinite if the motion in between
-is not judged. shortest: duration of the shortest exchange [s]. vague: largest excess over it at which the time of a
-measurement counts as known [s]. longest_gap: largest `seconds` over which changes of velocity are judged [s]. follows:
-fraction of a torque step that the motor has followed by the next sample. least: smallest change of velocity that counts
-as a jolt [rad/s].
+seen_at, seconds: time of the latest sample, and time since the previous one [s]; seconds is infinite if the motion in
+between is not judged. shortest: duration of the shortest exchange [s]. vague: largest excess over it at which the time
+of a measurement counts as known [s]. longest_gap: largest `seconds` over which changes of velocity are judged [s].
+follows: fraction of a torque step that the motor has followed by the next sample. least: smallest change of velocity
+that counts as a jolt [rad/s].
 """
 
 _DRIVE = np.dtype([(name, "f8") for name in ("constant", "goal", "felt")])
@@ -343,7 +343,7 @@ class ModelWatch:
         raise SafetyStop(said + self._near_limit(joint, state.position[joint]), Cause.UNEXPECTED)
 
     def _near_limit(self, joint: int, angle: float) -> str:
-        """Return the sentence for a joint that may have met a hard stop; empty far from its position limits."""
+        """Return the sentence for a joint that may have met a hard stop; "" if it is far from its position limits."""
         low, high = self._limits[joint]
         limit = low if angle - low < high - angle else high
         if abs(angle - limit) > _NEAR_LIMIT * (high - low):

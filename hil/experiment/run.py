@@ -49,7 +49,7 @@ _DESCRIBED = (
     "Since the motion had just begun, check first whether the configuration fits the arm: each joint's "
     "direction, id, torque_constant and wiring."
 )
-"""Advice for a stop within this time of the first goal [s], unless an earlier run has shown that the arm obeys."""
+"""Advice for a stop within `_FIRST_S` [s] of the first goal, unless an earlier run has shown that the arm obeys."""
 
 _MOST_UNSEEN = 20
 """Number of progress reports that may be queued for the observer (about one second)."""
@@ -58,7 +58,7 @@ _REPEAT_S = 0.05
 """Time after which the torque-off command is sent again to a servo that does not answer [s]."""
 
 _PATIENCE_S = 0.2
-"""Time that a finished run waits for the observer [s]."""
+"""Time for which a finished run waits for the observer [s]."""
 
 
 def run_experiment(
@@ -125,7 +125,7 @@ def run_experiment(
 
 @contextmanager
 def _with_torque(torque: str) -> Iterator[None]:
-    """Append the torque state to an error in closing the recording, or to a stop request made while torque is cut."""
+    """Append the torque state to an error while closing the recording, or to a stop request while torque is cut."""
     try:
         yield
     except (RunFolderError, StopRequested) as error:
@@ -261,7 +261,8 @@ def _check_unchanged(bus: ServoBus) -> Settings:
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, modes_seen_ago: float) -> None:
     """Name settings that another program changed. They are read only once torque is off, because reading takes time.
 
-    Changes that can explain a stop are named before its message; others, including any that may be later, after it.
+    Changes that can explain a stop are named before its message; others, including any that may have followed the stop,
+    after it.
     """
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return
@@ -351,7 +352,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:
-    """Check that the arm is in its rest pose; if it is not, zero_ticks, direction or the arm is not as described.
+    """Check that the arm is in its rest pose; if it is not, zero_ticks, direction or the arm's description is wrong.
 
     After a run that passed this check, friction may hold the arm at up to twice the tolerance.
     """

@@ -1,4 +1,4 @@
-"""How long servos have been silent, counting only the time during which this program was listening.
+"""How long servos have been silent.
 
 Only the time during which this program waited for a reply that did not come counts as silence; for a stalled computer,
 the limits of missed deadlines (`hil.experiment.deadlines`) apply.
@@ -68,7 +68,7 @@ class Silence:
             self._busy_until = now + BUSY_S
 
     def ask(self, now: float) -> None:
-        """Record an exchange that began at `now` [s], unless all joints replied to it (`all_heard`)."""
+        """Record an exchange that began at `now` [s]; not called if all joints replied to it (see `all_heard`)."""
         since = 0.0 if self._asked_at is None else now - self._asked_at
         self._turn = since if since < self._longest_turn else self._longest_turn
         self._asked_at = now

@@ -36,7 +36,7 @@ _REMEMBERED = 256
 """Number of latest goals kept."""
 
 _HELD_BEFORE = 4
-"""If writes are lost, a servo may also hold one of this many goals that were sent before the latest matching status."""
+"""If writes are lost, a servo may also hold one of the last `_HELD_BEFORE` goals before the latest matching status."""
 
 
 OLD_REPLIES = (
@@ -79,9 +79,9 @@ class StatusCheck:
         self._agreed_at = [0] * len(config.joints)
         self._is_foreign = [False] * len(config.joints)
         self._missed_at = [-1] * len(config.joints)
-        """Number of goals sent when a status last differed, by joint."""
+        """Number of goals that had been sent when a status last differed, by joint."""
         self._ticks = [(-1.0, 0.0)] * len(config.joints)
-        """Servo's and computer's clock in the latest status [s], by joint."""
+        """Servo's and computer's clock readings in the latest status [s], by joint."""
         self._foreign = [ForeignValues() for _ in config.joints]
         """Goals in the status that this program never sent, by joint."""
         # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
@@ -124,7 +124,7 @@ class StatusCheck:
     def look_at_watchdog(self, ticks: int) -> tuple[Cause, str] | None:
         """Check a servo's Bus Watchdog [20 ms]; return the fault's cause and text, or None.
 
-        While the arm is lowered, an unprotected servo is accepted: cutting torque would drop the arm.
+        While the arm is being lowered, an unprotected servo is accepted: cutting torque would drop the arm.
         """
         if ticks == self._armed or (self._bears_errors and ticks != WATCHDOG_TRIPPED):
             return None
@@ -179,8 +179,9 @@ class StatusCheck:
         return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {self.why_lost()}"
 
     def _late(self, joint: int, held: float, former: float, ago: int) -> int:
-        """How many cycles late a servo's replies are, as it holds a goal that it had been sent, but did not hold, when
-        its status last differed, `ago` cycles before; 0 if they need not be late. former: the goal held then [A or V].
+        """By how many cycles a servo's replies are late, given that it holds a goal that had been sent, but was not
+        held, when its status last differed, `ago` cycles before; 0 if they need not be late. former: the goal held then
+        [A or V].
         """
         half = self._half_tick[joint]
         for cycles, goals in enumerate(reversed(self._goals)):
@@ -190,7 +191,7 @@ class StatusCheck:
         return 0
 
     def why_lost(self) -> str:
-        """Return why goals are lost: bytes that arrive when none should destroy them on the wire."""
+        """Return why goals are lost, for example to unexpected bytes on the wire."""
         refused = (
             "Goals are being lost in transit, the servo refuses them (check its cable and limits), or a device on the "
             "bus repeats its old replies."
@@ -255,7 +256,7 @@ class StatusCheck:
 
 
 def _unlike_armed(longer: int) -> str:
-    """What a changed watchdog timeout means; longer: by how much [20 ms], 0 if it is off."""
+    """What a changed watchdog timeout means; longer: its increase [20 ms], 0 if it is off."""
     if not longer:
         return "is no longer protected"
     return f"stops by itself {'later' if longer > 0 else 'earlier'} than intended"

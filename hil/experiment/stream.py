@@ -174,7 +174,7 @@ class Stream:
             raise
 
     def _name_lost_torque(self, error: ExperimentError | BusOverheard) -> None:
-        """Raise SafetyStop instead of an error that a servo without torque explains, if there is one."""
+        """Raise SafetyStop instead of `error` if a servo without torque explains it."""
         is_explained = isinstance(error, DidNotMove | NotSettled)
         if not is_explained and not (isinstance(error, SafetyStop) and error.cause in _BY_LOST_TORQUE):
             return
@@ -255,7 +255,7 @@ class Stream:
             self._play(segment.period_current, Phase.WARM_UP)
 
     def _play_periods(self, segment: Segment) -> None:
-        """Play periods until one matches its predecessor and so has settled; then play the other periods to be
+        """Play periods until one matches its predecessor, so the motion has settled; then play the other periods to be
         recorded.
         """
         samples = len(segment.period_current)

@@ -40,7 +40,7 @@ MOVED_STEPS = 26
 _STILL = 0.02  # rad, allowed range of a simulated joint whose real counterpart stood still
 _MOST_RAISES, _RAISE = 12, (0.05, 0.25)
 """If a simulated joint moves although the real one stood still, the logarithm of its friction is increased, at most
-this many times, by a random amount from this range.
+`_MOST_RAISES` times, by a random amount from the range `_RAISE`.
 """
 
 _INFLATIONS = (12.0, 6.0, 4.0, 2.0)
@@ -195,8 +195,8 @@ def prior_belief(config: Config, arms: int, seed: int = 0) -> Belief:
 def earlier_belief(config: Config, result: Result, arms: int) -> Belief:
     """Draw the belief from the result of an earlier run on the same arm. Raises ConfigError.
 
-    Terms that the result's model lacks are left out. Friction is drawn with a wider spread than its error bars, since
-    it varies with temperature.
+    Terms that the result's model lacks are left out. Friction is drawn with a wider spread than its error bars
+    indicate, since it varies with temperature.
     """
     prior = prior_belief(config, arms)
     random = np.random.default_rng((0, 10))

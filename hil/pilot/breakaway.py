@@ -1,4 +1,4 @@
-"""Breakaway of joints that friction holds: torque rises from run to run, and a run ends soon after a joint moves.
+"""Breakaway of joints held by friction: torque rises from run to run, and a run ends soon after a joint moves.
 
 Just above a joint's static friction, motion grows quickly: on many of the plausible arms even a few percent more torque
 makes a joint exceed a limit. Therefore the guard is given narrow limits for such joints, and the torque is raised by a
@@ -15,7 +15,8 @@ from hil.pilot.options import PilotOptions
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
-    """Return `torque` (joints,) [N m] with joints that stood `still` raised to `ratio` times their `former` torque.
+    """Return `torque` (joints,) [N m] with that of joints that stood `still` raised to `ratio` times their `former`
+    torque.
 
     most: upper limit for those joints, set by the current limits (joints,) [N m].
     """

@@ -1,4 +1,4 @@
-"""Paths of a pilot of a spatial arm: designed once for all steps and scaled down in the first ones."""
+"""Paths for the pilot runs of a spatial arm: designed once for all steps and scaled down in the first ones."""
 
 from dataclasses import dataclass
 
@@ -39,7 +39,7 @@ class Reserve:
     clearance: float = 0.01
 
     def larger(self, shortage: float) -> "Reserve":
-        """Return a larger reserve. shortage: shortfall of the predicted clearance [m], otherwise 0."""
+        """Return a larger reserve. shortage: shortfall of the predicted clearance [m], or 0."""
         position = min(MORE * self.position, MOST_POSITION)
         return Reserve(position, self.speed / MORE, self.torque / MORE, self.clearance + shortage)
 
@@ -68,7 +68,7 @@ class Paths:
     def of(cls, config: Config, thought: ChainTorque, reserve: Reserve = RESERVE, tell: Tell | None = None) -> "Paths":
         """Design the paths. Raises NoSafeTorque if no path is safe, ConfigError, or ArmFileError.
 
-        thought: assumed model of the arm. tell: called with the number of steps done and their total.
+        thought: assumed model of the arm. tell: called with the number of steps done and the total number.
         """
         check_rest_pose(config)
         known, space = known_chain(config), Space.of(config)
@@ -109,7 +109,7 @@ class Paths:
         return cls(config, designer, best, other, reserve)
 
     def amplitude_over(self, other: "Paths") -> float:
-        """Return the largest ratio of a joint's peak excursion or speed in these paths to that in `other` paths."""
+        """Return the largest ratio of a joint's peak excursion or speed in these paths to that in the `other` paths."""
         pairs = (self.identify, other.identify), (self.held_out, other.held_out)
         return max(float((_peaks(mine.path) / _peaks(its.path)).max()) for mine, its in pairs)
 

@@ -126,8 +126,8 @@ class ChainSearch(SafeShares):
         return found
 
     def limit_after(self, error: ExperimentError, found: Found) -> None:
-        """Reduce the largest allowed amplitude after a run that was stopped, unless it did not settle or a joint did
-        not move.
+        """Reduce the largest allowed amplitude after a run was stopped, unless this was because it did not settle or a
+        joint did not move.
         """
         if not isinstance(error, NotSettled | DidNotMove):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
@@ -218,7 +218,7 @@ def identify_chain_in_steps(
 def _full(search: ChainSearch) -> str:
     """Play the full run; repeat it with a smaller amplitude if it exceeds a limit or never settles.
 
-    If the last run fails only in its second path, which only serves for validation, the first path suffices.
+    If the last run fails only in its second path, which serves only for validation, the first path suffices.
     """
     tries = 3
     for number in range(1, tries + 1):

@@ -168,7 +168,7 @@ class SafeShares:
         return ""
 
     def _other_seed(self) -> float | None:
-        """Design paths from another seed; return the ratio of new to old amplitude, None if there are none."""
+        """Design paths from another seed; return the ratio of new to old amplitude, None if no path is safe."""
         experiment = self.given.experiment
         other = experiment.model_copy(update={"seed": experiment.seed + _NEXT_SEED})
         given, former = self.given.model_copy(update={"experiment": other}), self.paths
@@ -209,7 +209,8 @@ class SafeShares:
         return found, why
 
     def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
-        """Return the first safe share of the paths, why a larger one is unsafe, and how much clearance that lacks [m].
+        """Return the first safe share of the paths, why a larger one is unsafe, and the clearance that the larger one
+        lacks [m].
 
         If neither the first share nor the last one, tried on few arms, is safe, those in between are not tried.
         """

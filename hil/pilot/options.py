@@ -20,9 +20,7 @@ class PilotOptions:
     certain_share: float = 0.85
     """Fraction of a limit that a typical arm should reach."""
     certain_share_known: float = 0.68
-    """Fraction of a limit that a typical arm should reach if the belief comes from an earlier result, whose uncertainty
-    another run would hardly reduce.
-    """
+    """`certain_share` if the belief comes from an earlier result, whose uncertainty another run would hardly reduce."""
 
     pilot_period_share: float = 0.5
     """Period of a pilot, relative to experiment.period."""
@@ -51,11 +49,14 @@ class PilotOptions:
     friction.
     """
     worthwhile_raise: float = 1.15
-    """Minimum ratio of the new torque to the last run's that justifies another run if little of the range is unused."""
+    """Minimum ratio of the new torque to the last run's that justifies another run if little of the range is unused
+    (see `fair_share`).
+    """
     worthwhile_raise_far: float = 1.03
-    """Minimum ratio of the new torque to the last run's that justifies another run if more of the range is unused."""
+    """Replaces `worthwhile_raise` if much of the range is unused."""
     fair_share: float = 0.7
-    """If a typical arm reaches more than this fraction of a limit, little of the range counts as unused."""
+    """If each joint of a typical arm reaches more than this fraction of a limit, little of the range counts as unused.
+    """
 
     wide_range: float = 0.74
     """Other waves are tried if a joint uses less than this fraction of its position range."""
@@ -65,8 +66,7 @@ class PilotOptions:
     falling_raise: float = 1.35
     """Maximum ratio of the torques of successive runs of an arm that falls over when it is stopped."""
     falling_breakaway_raise: float = 1.2
-    """Ratio of successive peak torques of a joint that has not moved yet, on an arm that falls over when it is stopped.
-    """
+    """`breakaway_raise` for an arm that falls over when it is stopped."""
     falling_share: float = 0.85
     """Fraction of the limits that runs may use on an arm that falls over when it is stopped."""
     min_falling_torque: float = 0.05

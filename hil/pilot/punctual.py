@@ -10,7 +10,7 @@ MOST_REPEATS = 3
 
 
 def punctual(play: Callable[[], str], config: Config, folder: RunFolder, name: str, say: Callable[[str], None]) -> str:
-    """Return what `play` returns; repeat it if deadlines were missed, at most MOST_REPEATS times.
+    """Call `play` and return its result; repeat this if deadlines were missed, at most MOST_REPEATS times.
 
     The recording of a stopped run is set aside in `folder`. Raises the same errors as `play`.
     """

@@ -59,10 +59,10 @@ class Search:
     """Range of motion of each joint in the earlier run from which the belief comes (joints,) [rad], if known."""
 
     fast: Mask = field(init=False)
-    """Joints that exceeded their velocity limit in the last run before they had moved (joints,)."""
+    """Joints that exceeded their velocity limit in the last run before moving by MOVED_STEPS (joints,)."""
     calm: Array = field(init=False)
-    """Cap on the torque (joints,) [N m], below that of all runs in which a joint exceeded its velocity limit before it
-    had moved; infinite if there were none.
+    """Cap on the torque (joints,) [N m], below that of all runs in which a joint exceeded its velocity limit before
+    moving by MOVED_STEPS; infinite if there were none.
     """
 
     def __post_init__(self) -> None:
@@ -126,7 +126,7 @@ class Search:
         self.pose = _within_limits(self.config, played.seen.end, self.options.start_inside)
 
     def _slow_down(self, played: Played) -> None:
-        """Limit the torque of joints that exceeded their velocity limit before they had moved."""
+        """Limit the torque of joints that exceeded their velocity limit before moving by MOVED_STEPS."""
         limit = np.array([joint.velocity_limit for joint in self.config.joints])
         self.fast = played.passed_velocity_limit & ~self.moved & (played.step.seen[2] > limit)
         calmer = self.options.torque_after_limit * played.step.peak_torque
@@ -273,8 +273,8 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """Return `found` or, if it leaves much of the range unused, the best amplitude with other waves if that uses
-        more.
+        """Return `found` or, if it leaves much of the range unused, the best amplitude with other waves, provided that
+        it uses more.
         """
         options = self.options
         limited = (found.peak_torque >= options.at_limit * most_torque(config)).all() or self.cap is not None
@@ -387,7 +387,7 @@ def _from_anywhere(config: Config) -> Config:
 
 
 def _within_limits(config: Config, pose: Array, inside: float) -> Array:
-    """Clip a pose that a stopped run left beyond the limits to within them: the next run begins by moving inwards."""
+    """Clip a pose in which a stopped run left the arm beyond its limits: the next run begins by moving inwards."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     return np.asarray(np.clip(pose, middle - inside * half, middle + inside * half))

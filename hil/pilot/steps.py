@@ -77,7 +77,7 @@ class Played:
 
     step: comparison with the prediction. seen: commands and motion; None if too few samples were recorded. torque:
     sentence about the final torque state. error: error that ended the run early, or None; only errors that are
-    informative about the arm, not those of servos, bus or user.
+    informative about the arm, not those of the servos, the bus or the user.
     """
 
     step: Step
@@ -117,9 +117,8 @@ class Player:
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude, arms: Ensemble) -> Played:
         """Play one run on an arm that could be any of `arms`, compare it with the prediction, and report.
 
-        A run that is stopped because this computer was late is repeated. Raises the same errors as a run, except
-        those that are informative about the arm: limit exceeded, no motion, no steady motion, a period that differs
-        from the one before.
+        A run that is stopped because this computer was late is repeated. Raises the same errors as a run, except those
+        that are informative about the arm (`tells_of_the_arm`).
         """
         torque, error = "", None
         try:

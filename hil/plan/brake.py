@@ -94,7 +94,7 @@ class Brake:
         ]
 
     def _pushes(self, reported: list[float], visible: list[float]) -> bool:
-        """Whether a joint is clearly faster than when braking began, by its reported or its visible speed."""
+        """Whether a joint is clearly faster than when braking began, judging by its reported or its visible speed."""
         if self._first is None:
             self._first = reported, visible
         return any(

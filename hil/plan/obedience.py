@@ -1,10 +1,10 @@
-"""Detection of reversed motors while an arm is lowered: such a motor speeds its joint up instead of braking it.
+"""Detection of reversed motors while an arm is being lowered: such a motor speeds its joint up instead of braking it.
 
 While the torque is constant, a reversed motor cannot be distinguished from an external push: either way, the arm moves
-as if an additional torque acted on the joint. The goal of such a joint is therefore removed briefly, while the others
-are held. Unexplained torque that comes from the joint's own motor then falls in proportion to the motor's torque,
-through the same filter; torque from a push does not. After a fall that comes earlier or later, the joint is tested
-again. The test is so short that an unpowered joint gains less speed from gravity than a reversed motor would give it.
+as if an additional torque acted on the joint. The goal of a suspect joint is therefore removed briefly, while the other
+goals are held. Unexplained torque that comes from the joint's own motor then falls in proportion to the motor's torque,
+through the same filter; torque from a push does not. If it falls earlier or later than that, the joint is tested again.
+The test is so short that an unpowered joint gains less speed from gravity than a reversed motor would give it.
 """
 
 from collections.abc import Sequence
@@ -30,10 +30,10 @@ above the first limit, the joint as pushed up to the second; in between, it is t
 """
 
 MOST_TURNED = 3.0
-"""Ratio of the two drops above which the unexplained torque did not come from the joint's motor alone."""
+"""Ratio of drops, as in `TURNED`, above which the unexplained torque did not come from the joint's motor alone."""
 
 UNEVEN = 0.3
-"""Deviation from a drop in proportion to the joint's own torque, relative to the whole drop, above which the
+"""Deviation from a drop in proportion to the joint's own torque, relative to the total drop, above which the
 unexplained torque has another cause.
 """
 

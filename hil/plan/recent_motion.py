@@ -19,12 +19,13 @@ from hil.drivers.state import State
 __all__ = ["RecentMotion", "Travel"]
 
 SHORT_S, LONG_S = 0.004, 0.02
-"""The two spans over which motion is judged [s]; each reaches back to the latest exchange that is at least that old."""
+"""The two spans over which motion is evaluated [s]; each reaches back to the latest exchange that is at least that old.
+"""
 
 _OLDEST_S = 0.05
 _LONGER = 1.5
-"""Largest age of a position that is used: in seconds, or as a multiple of the time between two exchanges, whichever is
-longer.
+"""Largest age of a position that is used: the longer of `_OLDEST_S` [s] and `_LONGER` times the time between two
+exchanges.
 """
 
 _STEPS = 2.0
@@ -100,8 +101,8 @@ class RecentMotion:
         return all(not CONTRADICTS * each.low <= velocity <= CONTRADICTS * each.high for each in travels)
 
     def currents(self, joint: int) -> list[tuple[float, float]]:
-        """Return the goals and currents of the latest exchanges that the joint answered; a current belongs to the goal
-        of the exchange before.
+        """Return the goals and currents of the latest exchanges that the joint answered; each current belongs to the
+        goal of the previous exchange.
         """
         return [
             (before.goal_current[joint], state.current[joint])

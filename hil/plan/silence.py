@@ -14,13 +14,14 @@ _ROUNDING_S = 1e-6
 
 
 BRIDGED_S = 0.06
-"""How long servos may fail to reply while an arm is lowered [s]. Torque must be off 100 ms after the last reply;
+"""How long servos may fail to reply while an arm is being lowered [s]. Torque must be off 100 ms after the last reply;
 switching it off takes some time.
 """
 
 BRIDGED_ALONE_S = 0.028
-"""How long servos may fail to reply while an arm is lowered and another servo replies [s]. The silent servo may have
-changed its ID: then only its Bus Watchdog, which counts from the last packet on the bus for any servo, can stop it.
+"""How long servos may fail to reply while an arm is being lowered and another servo replies [s]. The silent servo may
+have changed its ID: then only its Bus Watchdog, which counts from the last packet on the bus for any servo, can stop
+it.
 """
 
 
@@ -42,12 +43,12 @@ def missing_limit(config: Config) -> Limit:
 
 
 def bridged_limit(config: Config) -> Limit:
-    """How long a servo may fail to reply while a spatial arm is lowered."""
+    """How long a servo may fail to reply while a spatial arm is being lowered."""
     return _bounded(Limit(BRIDGED_S, "lowering the arm"), config.safety.watchdog)
 
 
 def bridged_alone_limit(config: Config) -> Limit:
-    """How long a servo may fail to reply while a spatial arm is lowered and another servo replies."""
+    """How long a servo may fail to reply while a spatial arm is being lowered and another servo replies."""
     return _bounded(Limit(BRIDGED_ALONE_S, "lowering the arm while other servos answer"), config.safety.watchdog)
 
 

@@ -23,8 +23,8 @@ INTEGRAL_TIME_S = 1.0
 """Time after which the integral of a constant deviation adds as much current as the spring [s]."""
 
 BALANCED_RAD = 0.02
-"""Deviation from the rest pose below which the integral stops growing [rad]: friction holds an arm this close to
-balance.
+"""Deviation from the rest pose below which the integral stops growing [rad]: friction can hold an arm that is this
+close to balance.
 """
 
 

@@ -1,6 +1,6 @@
 """Path along which a stop lowers a spatial arm: from any pose to the rest pose, clear of obstacles, in bounded time.
-The path is straight in joint space if that is clear. Otherwise it leads straight to the first reachable pose of the
-planned transition from the rest pose, and follows that transition backwards, which is known to be clear.
+The path is straight in joint space if a straight one is clear. Otherwise it leads straight to the first reachable pose
+of the planned transition from the rest pose, and follows that transition, which is known to be clear, backwards.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Comparison of two identifications of one arm: which parameters changed significantly.
 
-Every common parameter is tested on its own, and the friction of each joint also as a whole
+Every common parameter is tested individually, and each joint's friction also as a whole
 (hil.estimation.changes.friction_change). Holm's step-down correction keeps the probability of any false alarm in the
 whole table at `FALSE_ALARMS` (S. Holm, Scandinavian Journal of Statistics 6 (1979) 65). A change must also be larger
 than the fraction `least_share` of the parameter's magnitude, since standard errors cover noise only.
@@ -56,7 +56,7 @@ class Difference:
     """The changes from one run to another.
 
     only_before, only_after: terms that only one of the two models has. detectable: smallest change of each friction
-    term alone that two runs like these would show with a probability of 95 % [% of its earlier value].
+    term alone that two such runs would reveal with a probability of 95 % [% of its earlier value].
     """
 
     before: str
@@ -67,7 +67,7 @@ class Difference:
     detectable: Mapping[str, float] = field(default_factory=dict)
     trust: tuple[str | None, str | None] = (None, None)
     other_joints: tuple[str, ...] = ()
-    """Warnings: one sentence per joint whose description differs, and one if a run is compared with itself."""
+    """Warnings: one sentence per joint that the runs describe differently, and one if a run is compared with itself."""
 
     @property
     def changed(self) -> tuple[Change, ...]:
@@ -217,7 +217,7 @@ def _holm(p: dict[str, float], level: float) -> set[str]:
 
 
 def _scale(before: ArmModel, after: ArmModel, name: str) -> float:
-    """Magnitude that a change is compared with: the parameter's, or the joint's Coulomb friction for an offset."""
+    """Magnitude to compare a change with: the parameter's own or, for an offset, the joint's Coulomb friction."""
     values = [abs(model.values[name]) for model in (before, after)]
     kind, _, joint = name.rpartition("_")
     if kind == "offset":

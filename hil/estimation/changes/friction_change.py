@@ -1,8 +1,8 @@
 """Test whether one joint's friction changed between two runs, using the full covariance of its parameters.
 
-Friction parameters are known far better in combination than individually: a change of one of them by 10 % may be less
-than its own standard error and still be obvious. Let d be the difference of the joint's friction parameters between the
-runs, and S the sum of their covariances in both. Two kinds of test are made.
+Friction parameters are known far better in combination than individually: a 10 % change in one of them may be smaller
+than its standard error and still be obvious. Let d be the difference in the joint's friction parameters between the
+runs, and S the sum of their covariances in the two runs. Two kinds of test are made.
 
 one term alone    Did only term i change? The most powerful test is z_i = (S^-1 d)_i / sqrt((S^-1)_ii), and
                   (S^-1 d)_i / (S^-1)_ii is the change that this implies (generalised least squares).
@@ -27,7 +27,7 @@ from hil.results.parts import Covariance
 
 KINDS = ("viscous", "coulomb", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry")
 """Terms of sliding friction, and the width of the Coulomb step, which the data determine only together with the
-rise.
+Stribeck rise.
 """
 REPEATABILITY = 0.005
 """Run-to-run standard deviation of a friction parameter of an unchanged arm, relative to its value."""
@@ -38,9 +38,9 @@ class FrictionChange:
     """The friction of one joint in two runs.
 
     term: the single term whose change explains the difference best. before, after: its values if nothing else in the
-    joint's friction changed. std: standard error of that change [unit of the term]. z: change divided by `std`.
-    p: probability of a difference at least this large, in any term, if the joint is unchanged. stds: standard error of
-    the change of each term alone [unit of the term].
+    joint's friction changed. std: standard error of that change [unit of the term]. z: change divided by `std`. p:
+    probability of a difference at least this large, in any term, if the joint is unchanged. stds: standard error of
+    each term's change if only that term changed [unit of the term].
     """
 
     joint: int
@@ -61,7 +61,7 @@ class FrictionChange:
 def friction_changes(
     models: tuple[ArmModel, ArmModel], covariances: tuple[Covariance | None, Covariance | None]
 ) -> list[FrictionChange]:
-    """Test the friction of every joint; joints without usable covariances in both runs are left out."""
+    """Test every joint's friction for a change; joints without usable covariances in both runs are left out."""
     if covariances[0] is None or covariances[1] is None:
         return []
     kept = covariances[0], covariances[1]

@@ -62,8 +62,8 @@ class Judge:
         self._held_out = held_out
 
     def error(self, parameters: Mapping[str, float], period: SettledPeriod | None = None) -> float | None:
-        """Prediction error relative to the motion's RMS, for the worst joint; None if nothing was held out or if the
-        simulated arm diverges. period: the period to predict, by default the held-out one.
+        """Prediction error relative to the motion's RMS, for the worst joint; None if nothing was held out or the
+        simulation diverges. period: the period to predict, by default the held-out one.
         """
         shown = self._held_out if period is None else period
         if shown is None:
@@ -116,7 +116,7 @@ def _methods(config: Config, period: SettledPeriod, judge: Judge) -> Iterator[Pe
 
 
 def _best(fit: Callable[[float], tuple[Array, Array]], judge: Judge, period: SettledPeriod) -> Peer:
-    """The result at the cut-off that gives the closest simulation of the fitted period, as for planar arms."""
+    """The result with the cut-off frequency that reproduces the fitted period best, as for planar arms."""
     model = judge.model
     found: list[tuple[float, Peer]] = []
     for cutoff in CUTOFFS:

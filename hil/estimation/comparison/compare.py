@@ -33,8 +33,8 @@ OURS_PLAIN = "hil_coulomb"
 class MethodResult:
     """The entry of one method in compare.json: parameters and standard errors by name [SI], computing time [s].
 
-    settings_tried: number of settings tried; the best is reported. worst_relative_error: largest relative error of
-    inertias, gravity and friction, on a fake arm only. held_out_rms: open-loop prediction error of the held-out
+    settings_tried: number of settings tried; the best result is reported. worst_relative_error: largest relative error
+    of inertias, gravity and friction, on a fake arm only. held_out_rms: open-loop prediction error of the held-out
     multisine relative to the RMS of its motion, for the worst joint; None if the simulation does not settle or there
     was no such multisine.
     """

@@ -1,6 +1,6 @@
 """Currents that differ from the commanded ones: they were clipped, or this program's goals did not cause them.
 
-A clipped current is smaller than a large goal, follows a small one, and never opposes it. Any other deviation has
+A clipped current is smaller than a large goal, follows a small one, and never opposes its goal. Any other deviation has
 another cause: goals were altered in transit or by another program, or the reported current is wrong.
 """
 
@@ -27,15 +27,16 @@ _RECENT = 4
 """Number of latest goals that a lagging current may still be following."""
 
 _BEYOND, _BEYOND_OFTEN = 0.25, 0.02
-"""A current was not the commanded one if it deviates this much from all recent goals and from 0, relative to the
-largest goal and beyond its noise. A warning is given if the fraction of such samples exceeds the second value.
+"""A current counts as different from the commanded one if it is outside the range spanned by 0 and all recent goals by
+more than its noise and this fraction of the largest goal. A warning is given if the fraction of such samples exceeds
+the second value.
 """
 
 _SIGMAS = 3.0
-"""Noise of a reading that counts as no deviation, in standard deviations."""
+"""Largest deviation of a reading that is attributed to noise, in standard deviations."""
 
 _QUANTILE, _OF_NORMAL = 0.25, 0.3186
-"""Noise is judged by this quantile of its magnitude, because goals that are altered now and then must not count as
+"""Noise is estimated from this quantile of its magnitude, because goals that are altered now and then must not count as
 noise; the second value is that of the standard normal distribution.
 """
 
@@ -43,7 +44,7 @@ _FEWEST_AT_REST = 30
 """Minimum number of consecutive readings at one goal from which their noise is measured."""
 
 _SMALL, _LEAST = 0.5, 0.1
-"""Highest and lowest goals that cannot be clipped but are large enough to judge, relative to the largest measured
+"""Highest and lowest goals that cannot be clipped but are large enough to evaluate, relative to the largest measured
 current.
 """
 
@@ -66,7 +67,7 @@ def current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindin
 
 
 def _findings(config: Config, samples: NDArray[np.void], judged: Mask) -> CurrentFindings:
-    """Like `current_findings`, but only for the judged samples; the others only help to measure the noise."""
+    """Like `current_findings`, but only for the samples in `judged`; the others only help to measure the noise."""
     lower = "current_limit" if config.experiment.pilot else "peak_torque"
     warnings, names = [], []
     for name, every_goal, every in _currents(config, samples):
@@ -97,8 +98,8 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
 
 
 def _noise(goal: Array, measured: Array) -> float:
-    """Standard deviation of a current reading, from the recording itself: its scatter at constant goals or, if larger,
-    its deviation from the goals or the second difference of that, whichever is smaller.
+    """Standard deviation of a current reading, estimated from the recording: its scatter at constant goals or, if
+    larger, its deviation from the goals or (if smaller) the second difference of that deviation.
 
     The current may lag the goal by a few samples: the lag that leaves the smallest deviation is used.
     """
@@ -169,7 +170,7 @@ def _least(goal: Array) -> Array:
 
 
 def _short_part(goal: Array, measured: Array, margin: float) -> float:
-    """Fraction of the samples with large goals whose current is too small."""
+    """Among the samples with large goals, the fraction whose current is too small."""
     least = _least(goal)
     large = (least > LARGE * np.abs(goal).max()) & np.isfinite(measured[1:])
     if not large.any():

@@ -55,7 +55,7 @@ class Sag:
 
 
 def supply_sag(config: Config, samples: NDArray[np.void]) -> Sag | None:
-    """The drop of the supply voltage under load in a whole recording; None if it is not worth reporting."""
+    """The drop in the supply voltage under load over a whole recording; None if it is too small to report."""
     goal, velocity, volts = samples["goal_current"], samples["velocity"], samples["supply_voltage"]
     joints = goal.shape[1]
     read = np.isfinite(volts) & np.isfinite(velocity).all(axis=1)[:, None]

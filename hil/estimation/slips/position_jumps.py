@@ -1,7 +1,7 @@
 """Jumps of a position that its velocity does not explain: an encoder that slipped, or a horn that moved on its shaft.
 
-The guard stops a run at once if a position moves farther than the joint can; a smaller jump only shifts everything
-after it.
+The guard stops a run at once if a position changes by more than the joint can move; a smaller jump merely shifts all
+later readings.
 """
 
 import numpy as np

@@ -1,6 +1,7 @@
 """Jumps of a recorded position that no smooth motion explains, for recordings without a velocity.
 
-Around each interval between samples, a cubic with a step is fitted to the positions, and compared with those elsewhere.
+Around each interval between samples, a cubic with a step is fitted to the positions; the step is compared with those
+found elsewhere.
 """
 
 from collections.abc import Sequence
@@ -24,7 +25,7 @@ BETTER = 0.25  # largest sum of squared residuals with a step, relative to that 
 
 @dataclass(frozen=True)
 class Jump:
-    """A jump by `size` [rad] at `time` [s]. joint, recording: indices, counted from 0."""
+    """A jump of `size` [rad] at `time` [s]. joint, recording: indices, counted from 0."""
 
     recording: int
     joint: int

@@ -1,4 +1,4 @@
-"""A joint that came to rest at a different angle than before the run: its horn or encoder may have slipped.
+"""A joint whose rest angle changed during the run: its horn or encoder may have slipped.
 
 A horn that slips smoothly leaves no jump in the readings. The only trace is that the arm then hangs at a different
 angle.
@@ -18,7 +18,7 @@ LEAST_RAD = 0.1
 """Smallest shift that is reported [rad]."""
 
 _FRICTION_TIMES = 2.0
-"""Multiple of the servo's typical breakaway friction that may hold a joint away from where it would hang."""
+"""Multiple of the servo's typical breakaway friction that can hold a joint away from where it would hang."""
 
 _STILL_RAD = 0.02
 """Range of positions within which an arm counts as resting [rad]."""

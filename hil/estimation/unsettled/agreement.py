@@ -1,4 +1,4 @@
-"""Check whether several recordings show the same arm, so that a change of load is not mistaken for a missing term."""
+"""Check whether recordings come from the same arm, so that a change of load is not mistaken for a missing term."""
 
 from collections.abc import Sequence
 

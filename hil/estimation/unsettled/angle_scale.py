@@ -1,9 +1,9 @@
-"""Detection of angles with a wrong scale: an encoder's resolution, a belt or a gear ratio other than stated.
+"""Detection of angles with a wrong scale: an encoder resolution, belt ratio or gear ratio other than the stated one.
 
 A joint's equation is linear in its angle except for gravity, so only gravity reveals the scale. Near the angle at which
 the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, a weaker gravity and a spring: with a
 spring, an offset and an encoder zero, a fit explains angles with a wrong scale s down to the noise, but with wrong
-values. So if a fit found a spring, the motion is fitted again with the scale that would look like this spring instead.
+values. So if a fit finds a spring, the motion is fitted again without it, but with the scale that would imitate it.
 """
 
 import math
@@ -31,7 +31,7 @@ RESTS = 0.2  # largest torque of the spring where the joint would hang, relative
 class _Scale:
     """Angles of joint 1 that seem to be `factor` times the true ones.
 
-    by_zero: whether the encoder zero indicates the same.
+    by_zero: whether this factor was inferred from the encoder zero.
     """
 
     factor: float
@@ -43,7 +43,7 @@ def angle_scale(
 ) -> tuple[str, ...]:
     """A sentence if the spring and the encoder zero of joint 1 may be due to a wrong scale of its angle.
 
-    origin: the angles of the recordings at which their columns are 0 [rad], by default 0.
+    origin: the angles at which the recordings' position columns are 0 [rad]; by default, 0.
     """
     about = np.array(origin) if len(origin) else np.zeros(estimate.model.joints)
     scale = _candidate(recordings, estimate, about)
@@ -54,7 +54,7 @@ def angle_scale(
 def _candidate(recordings: Sequence[Recording], estimate: ShootingEstimate, about: Array) -> _Scale | None:
     """The scale of the first joint that would imitate the spring of the estimate.
 
-    Scales of other joints change the effect of these joints on the first one, which no spring imitates.
+    Scales of other joints change the effect of these joints on the first one, which no spring can imitate.
     """
     value, names = estimate.parameters, list(estimate.names)
     if SPRING not in names or not value["gravity_1"] > 0.0:

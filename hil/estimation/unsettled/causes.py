@@ -55,7 +55,7 @@ def causes(fitted: Fitted) -> tuple[str, ...]:
 
 
 def are_known(fitted: Fitted, found: tuple[str, ...]) -> bool:
-    """Whether `found`, from `causes`, names a cause and not only where the residual is large."""
+    """Whether `found`, from `causes`, names a cause, not just places where the residual is large."""
     where = fitted.recordings, fitted.names, fitted.predicted, fitted.estimate.segment_length
     return bool(found) and found != local_residual(*where)
 
@@ -72,7 +72,7 @@ def _clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
 
 
 def _unsigned(recordings: Sequence[Recording], joint: int) -> str:
-    """A sentence if the torque of a joint (from 1) never changes its sign; "" otherwise."""
+    """A sentence if the torque of a joint (from 1) never changes sign; "" otherwise."""
     torque = np.concatenate([each.torque[joint - 1] for each in recordings])
     if torque.min() < 0.0 < torque.max():
         return ""

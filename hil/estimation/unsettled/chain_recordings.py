@@ -116,9 +116,9 @@ def estimate_chain_recordings(
 
 
 def _drive(config: RecordingConfig, joints: int) -> Drive:
-    """The drive model of the file; by default, for several joints, a common delay and a lag of each.
+    """The drive model of the file; by default, for several joints, a common delay and a separate lag for each.
 
-    Other tools' recordings may have both, and lags that differ by joint are not explained by a delay.
+    Other tools' recordings may contain both, and a delay does not explain lags that differ between joints.
     """
     is_given = "model" in config.model_fields_set and "drive" in config.model.model_fields_set
     return config.model.drive if is_given or joints == 1 else "delay_lag"
@@ -145,7 +145,7 @@ def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescripti
 def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior, contradictory: bool) -> RecordedChain:
     """The fit. contradictory: whether the torques seem to contradict each other.
 
-    Their ratios are then fitted too, unless the likelihood finds that they agree; a regression does not fit them.
+    If so, their ratios are fitted too, unless the fit finds that the torques agree; a regression does not fit ratios.
     """
     if contradictory and all(each.between == "held" for each in recordings):
         found = identify_recordings(recordings, replace(model, torque_scale=True), prior)

@@ -1,4 +1,4 @@
-"""Mistakes in the columns of a spatial arm's recording: refused before the fit if clear, otherwise left to the fit."""
+"""Mistakes in the columns of a spatial arm's recording: clear ones are refused, others are left to the fit."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ ROUGHLY = 0.05  # assumed relative standard error of a ratio of torques that a r
 
 
 def refuse_chain_slips(check: ColumnCheck | None, joints: Sequence[str], source: str) -> None:
-    """Raise CsvError if signs are reversed, columns swapped or the times scaled. joints: their names."""
+    """Raise CsvError if signs are reversed, columns are swapped or times are scaled. joints: their names."""
     if check is None or not check.suspicious:
         return
     signs, swapped = check.reversed_columns(), check.swapped_columns()
@@ -38,7 +38,7 @@ def refuse_chain_slips(check: ColumnCheck | None, joints: Sequence[str], source:
 
 
 def late_torque(check: ColumnCheck | None, joints: Sequence[str], fitted: bool) -> tuple[str, ...]:
-    """A sentence about a torque logged late or early. fitted: whether the fit contains a delay common to all."""
+    """A sentence about a torque logged late or early. fitted: whether the fit contains a delay common to all joints."""
     late = None if check is None else check.late_torque()
     if late is None or (late.joint is None and fitted):
         return ()

@@ -35,7 +35,7 @@ def is_certain(defect: Defect) -> bool:
 
 
 def is_other_arm(defect: Defect) -> bool:
-    """Whether one of several recordings seems to be of another arm, or of the arm with another load."""
+    """Whether one of several recordings seems to come from another arm, or from the arm with another load."""
     return defect.hypothesis.course.kind == "recording" and defect.hypothesis.kind in {"arm", "load"}
 
 

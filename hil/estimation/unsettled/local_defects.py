@@ -1,4 +1,4 @@
-"""Location and kind of the parts of a recording that the fitted model does not explain although it explains the rest.
+"""Location and kind of the parts of a recording that the fitted model fails to explain, unlike the rest.
 
 These are frozen readings, missing torques, single wrong samples, and stops.
 """
@@ -181,7 +181,7 @@ def _departs(time: Array, values: Array, doubtful: Mask, least: float) -> Mask:
 
 
 def _stop(joint: _Joint) -> list[str]:
-    """Impacts at the same angle, which the joint never passes."""
+    """Repeated impacts at one angle, which the joint never passes."""
     known = np.isfinite(joint.position)
     time, position = joint.time[known], joint.position[known]
     lag = max(1, round(IMPACT_TIME / float(np.median(np.diff(time)))))

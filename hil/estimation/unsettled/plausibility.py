@@ -62,8 +62,8 @@ def _torques(recordings: Sequence[Recording]) -> list[str]:
 
 
 def _pendulum(estimate: ShootingEstimate, gravity: float) -> list[str]:
-    """Check inertia * gravity / weight, a length whatever the unit of torque; a wrong unit of time or angle makes it
-    implausible.
+    """Check inertia * gravity / weight, which is a length whatever the unit of torque; a wrong unit of time or angle
+    makes it implausible.
     """
     if gravity <= 0.0:
         return []
@@ -81,7 +81,7 @@ def _pendulum(estimate: ShootingEstimate, gravity: float) -> list[str]:
 
 
 def _link(estimate: ShootingEstimate, gravity: float) -> list[str]:
-    """Check coupling * gravity / gravity_2, the length of link 1 whatever the unit of torque."""
+    """Check coupling * gravity / gravity_2, which is the length of link 1 whatever the unit of torque."""
     value, names = estimate.parameters, list(estimate.names)
     if gravity <= 0.0 or "coupling" not in value:
         return []

@@ -31,7 +31,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
     """Raise CsvError if a sign is reversed, joints or torques are swapped, or an angle is measured from a fixed
     direction instead of from the previous link.
 
-    zero: columns.zero, which the recordings already contain; None if it is not known.
+    zero: columns.zero, which the angles in the recordings already include; None if it is not known.
     """
     _refuse_absolute(recordings, source, zero)
     order = suspect_order(recordings)
@@ -88,7 +88,7 @@ def refuse_stuck(recordings: Sequence[Recording], source: str, segment: float) -
 
 
 def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None) -> None:
-    """Raise CsvError if the angle of joint 2 is absolute, with the zero that then applies if it differs."""
+    """Raise CsvError if the angle of joint 2 is absolute; the message gives the new zero if that changes."""
     joints = recordings[0].joints
     free = suspect_absolute_unzeroed(recordings) if zero is None else None
     zero = zero or (0.0,) * joints
@@ -107,7 +107,7 @@ def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequenc
 
 
 def reversal_said(signs: Signs, joints: Sequence[str] = ()) -> str:
-    """Say which signs are reversed; the caller appends the gain from a change. joints: names, by default numbers."""
+    """Say which signs are reversed; the caller appends the gain of a correction. joints: names, by default numbers."""
     if signs.are_several:
         return f"{signs.said(joints)} are reversed: with these signs changed"
     return f"{signs.said(joints)} is reversed: with the sign changed"

@@ -112,8 +112,8 @@ def _turns(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
 
 
 def _flat(recordings: Sequence[Recording], joint: int, name: str, unexplained: bool) -> list[str]:
-    """Detect a torque that was clipped at its largest value; a commanded torque may stay constant if that explains the
-    motion.
+    """Detect a torque that was clipped at its largest value; a commanded torque is allowed to stay constant if that
+    explains the motion.
     """
     for each in recordings:
         size = np.abs(each.torque[joint])

@@ -17,7 +17,7 @@ nonlinearity, and twist of the joint between the servos.
 
 
 def opposed(joint: Joint) -> str:
-    """Return the question of whether the joint's two servos work against each other; "" if it has only one servo."""
+    """Return text asking whether the joint's two servos work against each other; "" if it has only one servo."""
     if not joint.seconds:
         return ""
     signs = [joint.direction, *(second.direction for second in joint.seconds)]

@@ -9,7 +9,7 @@ is tracked with three fading memories (leaky integrators): a short one, which re
 one, which reveals a gradual fault; and a slow one, which reveals creep. Rounding of positions and encoder noise do not
 accumulate in this difference. The contributions of a healthy servo are known:
 
-- a velocity that lags by tau, because the servo filters it: tau times the velocity, minus its mean over the memory. Any
+- a velocity that lags by tau, because the servo filters it: tau times (velocity minus its mean over the memory). Any
   lag up to `LAG_S` is accepted;
 - a velocity with a scale error: that fraction of the distance covered within the memory, at most `SCALE`;
 - a velocity that is rounded towards zero, or always downwards (which of the two a servo does is unknown). In the slow
@@ -28,8 +28,8 @@ perhaps during the last `LAG_S`. The distance covered before that must therefore
 the reported velocity is frozen.
 
 Lag and scale error are properties of a servo and do not change. A lag that changes is a fault
-(`hil.experiment.velocity.lag`). Once the motion has shown them, up to twice the estimated values are accepted, plus
-`MORE_LAG_S` and `MORE_SCALE` and twice their standard deviations.
+(`hil.experiment.velocity.lag`). Once the motion has revealed lag and scale error, up to twice the estimated values are
+accepted, plus `MORE_LAG_S` and `MORE_SCALE` and twice their standard deviations.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). The state that it keeps for
 a joint is a record of the type `MEMORY`.
@@ -66,8 +66,8 @@ STDS = 2.0
 """Number of standard deviations by which the estimates of lag and scale error may be wrong."""
 
 BIAS_LAG_S, BIAS_SCALE, BIAS_LAG_SHARE = 0.002, 0.005, 0.1
-"""Further errors assumed for these estimates, besides their standard deviations, when creep is judged [s, 1]. The last
-is relative to the lag times the range of velocities, since a filter is not a pure delay.
+"""Further errors assumed for the estimates of lag and scale error, besides their standard deviations, when checking for
+creep [s, 1]. The last is relative to the lag times the range of velocities, since a filter is not a pure delay.
 """
 
 _LAG_SHARE = 0.25
@@ -332,7 +332,7 @@ def _begin_same(same: Any) -> None:
 
 
 def _is_frozen(same: Any, moved: float, velocity: float, seconds: float, unknown: float, scale: float) -> bool:
-    """Process an interval over which the velocity has not changed; return whether it is frozen.
+    """Process an interval over which the velocity has not changed; return whether its reading is frozen.
 
     moved, unknown: change of position and its uncertainty [rad]. scale: largest accepted scale error.
     """
@@ -419,7 +419,7 @@ def _is_wrong(fading: Any, apart: float, unsure: float, velocity: float, lag: fl
 
 
 def _explained(fading: Any, unsure: float, velocity: float, lag: float, scale: float) -> tuple[float, float]:
-    """Return the difference accepted in either direction, and what the largest lag adds [rad]."""
+    """Return the difference accepted in either direction, and the offset due to the largest lag [rad]."""
     allowed = unsure + scale * abs(fading.far) + fading.curved + fading.unknown + _LAG_SHARE * lag * fading.span
     return allowed, lag * (velocity - fading.mean)
 

@@ -1,7 +1,7 @@
 """Noise of the current readings, measured while the arm rests, and what it means for the check of the current.
 
-The thresholds of `following` assume no more noise than usual. A noisier sensor gets wider ones, so that a healthy motor
-is not stopped.
+The thresholds of `following` assume no more noise than usual. A noisier sensor gets wider thresholds, so that a healthy
+motor is not stopped.
 """
 
 from collections import deque
@@ -23,7 +23,7 @@ FEWEST_READINGS, MOST_READINGS = 8, 256
 """Number of readings from which noise is first measured, and number of the latest ones that are kept."""
 
 _UNCERTAIN = 1.9
-"""By how much noise measured from n readings may be too small, relative to the true noise, times sqrt(n)."""
+"""Largest underestimate of noise measured from n readings, relative to the true noise, times sqrt(n)."""
 
 _MAD_TO_SIGMA = 1.4826
 """Ratio of standard deviation to median absolute deviation of a normal distribution."""
@@ -73,7 +73,7 @@ class CurrentNoise:
 
 @dataclass(frozen=True)
 class Noisy:
-    """A joint whose current reading is noisier than usual; `said` says so, and what this means.
+    """A joint whose current reading is noisier than usual; `said` reports this and its consequence.
 
     refused: why the joint cannot be monitored, and what to do; "" if it can.
     """

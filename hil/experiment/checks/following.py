@@ -14,12 +14,13 @@ goals, because a reply may be measured before or after the motor follows the lat
 error of `GAIN_ERROR`.
 
 Successive errors may be correlated, so each sample is weighted by the time that it represents. The unweighted sum must
-also reach h = `LEAST_RATIO`, which a healthy motor's does with a probability of at most exp(-h) after any given check.
+also reach h = `LEAST_RATIO`, which a healthy motor's sum does with a probability of at most exp(-h) after any given
+check.
 
 While a joint stands still, its readings may also freeze at the commanded current, and the goal may take seconds to get
-far from it. But a motor's current follows its goal: if all three readings stay exactly the same although the goals
-that they may reflect (those of the last `ANSWERS_S`) have changed, they are frozen. A constant sensor error cancels in
-this comparison.
+far from it. But a motor's current follows its goal: if the readings of position, velocity and current all stay exactly
+the same although the goals that they may reflect (those of the last `ANSWERS_S`) have changed, they are frozen. A
+constant sensor error cancels in this comparison.
 
 A current sensor may be noisier than assumed. Its noise is measured at constant goals, while the arm rests before the
 start (`current_noise`), and is a lower bound of sigma: a noisy reading then means that lost torque is found later, not
@@ -60,7 +61,7 @@ LEAST_RATIO = 10.0
 """Log likelihood ratio at which a current counts as zero, however low the rate."""
 
 NOISY_RATIO = 16.0
-"""The same for a sensor whose noise is known to be as large as assumed; most sensors have far less noise than that."""
+"""`LEAST_RATIO` for a sensor known to be as noisy as assumed; most sensors have far less noise than that."""
 
 _FEWEST = 2
 """Minimum number of samples that differ from the goal, however low the rate."""
@@ -98,7 +99,7 @@ MEMORY = np.dtype(
 
 per_square: 1 / (2 sigma^2). least_ratio: log likelihood ratio at which a current counts as zero. allowed: accepted
 deviation [A or V]; share: the same, relative to the goal; follow_time: how long a larger deviation may last [s].
-evidence, ratio, count: sum of the log likelihood ratios times seconds, without seconds, and its number of samples.
+evidence, ratio, count: sums of the log likelihood ratios, weighted by time [s] and unweighted, and their number.
 differs_for, differs: duration [s] and number of samples of a deviation.
 """
 

@@ -27,7 +27,7 @@ FARTHER_OUT_RAD = 0.01
 """How much farther out a joint may move if an earlier run left it beyond its limit [rad]."""
 
 MOST_OUTSIDE_RAD = 0.5
-"""How far beyond its limit a joint may start if an earlier run left it there [rad]; a light arm coasts on."""
+"""How far beyond its limit a joint may start if an earlier run left it there [rad], since a light arm coasts on."""
 
 LONG_GAP = 3.0
 """If the gap between two samples is longer than this [sample intervals], the motion in between is too uncertain to
@@ -49,8 +49,8 @@ JOINT = np.dtype(
 )
 """One joint: limits, latest state, what the latest check found, and the state that each check keeps.
 
-low, high: position limits [rad]. fastest: velocity limit [rad/s]. farthest: fastest change of a reported position
-[rad/s]. may_start_outside, is_followed, is_worked: whether the joint may start outside its limits, and whether
+low, high: position limits [rad]. fastest: velocity limit [rad/s]. farthest: fastest accepted change of a reported
+position [rad/s]. may_start_outside, is_followed, is_worked: whether the joint may start outside its limits, and whether
 `following` and `work` are checked. position, seen_at: latest position [rad], NaN before the first one, and its time
 [s]. found_outside: first position seen, if outside the limits [rad], otherwise NaN. moved, seconds, most: change of
 position [rad], the time that it represents [s], and the largest possible change [rad]. found: duration of a deviation
@@ -78,7 +78,7 @@ class JointChecks:
         self._check: Callable[..., int] = only_version(_look)
 
     def look(self, state: State, unsure: float) -> int:
-        """Check all joints; none may have missed this reply or the previous one.
+        """Check all joints, none of which has missed this reply or the previous one.
 
         Returns FINE, or CHECKS * joint + the number of the failed check for the first joint that fails one; later
         joints are not checked. unsure: excess duration of the exchange [s].

@@ -21,7 +21,7 @@ limit.
 """
 
 _LACKS_S, _EXPLAINED = 0.1, 0.5
-"""The supply explains missing torque if, within the last `_LACKS_S` [s], it caused at least this fraction of it."""
+"""The supply explains missing torque if it caused at least `_EXPLAINED` of it within the last `_LACKS_S` [s]."""
 
 _FEWEST = 4
 """Minimum number of readings from which to explain how a current differs from its goal."""
@@ -62,7 +62,7 @@ class JointFaults:
         return index, *explained[check](index, state)
 
     def lack_of_voltage(self, index: int, lacking: float, recent: Sequence[State]) -> Fault | None:
-        """Return the fault of a supply that explains a joint's missing torque [N m] in these exchanges, if it does."""
+        """Return the fault if the supply explains a joint's missing torque [N m] in these exchanges, otherwise None."""
         model = self._models[index]
         if model is None or not self._records[index]["is_followed"] or self._status.other_goal(index) is not None:
             return None
@@ -210,7 +210,7 @@ class JointFaults:
 
 
 def _is_stuck(readings: Sequence[tuple[float, float]], least: float) -> bool:
-    """Whether a current stayed exactly the same, other than 0, while its goal changed by more than `least`."""
+    """Whether a current stayed at exactly the same nonzero value while its goal changed by more than `least`."""
     if len(readings) < _FEWEST:
         return False
     goals, currents = zip(*readings, strict=True)

@@ -19,7 +19,7 @@ TOLERANCE_RAD = 0.04
 """A motor is considered reversed if the work that it has taken out of the arm, divided by the joint's largest planned
 torque, exceeds this [rad].
 
-Delays make a healthy motor take out up to 0.02 rad, with a heavy arm at 20 Hz.
+Delays cause a healthy motor to take out up to 0.02 rad, for a heavy arm at 20 Hz.
 """
 
 _OF_OTHERS = 0.5
@@ -28,7 +28,7 @@ _OF_OTHERS = 0.5
 MEMORY = np.dtype([("scale", "f8"), ("least", "f8"), ("done", "f8"), ("held", "f8")])
 """Constants and state of the check of one joint.
 
-scale: torque per goal [N m/A or N m/V]. least: work below which the sign is in doubt [J]. done: work done so far [J].
+scale: torque per goal [N m/A or N m/V]. least: work below which the sign is uncertain [J]. done: work done so far [J].
 held: latest goal [A or V].
 """
 

@@ -35,7 +35,7 @@ LEAVES_RAD = 0.35
 """Largest accepted tracking error [rad]: a joint with a larger one does not follow its path to the rest pose."""
 
 MOST_PATHS = 4
-"""Number of paths home, including the first, that an arm may be pushed off before it is given up."""
+"""Number of paths home, including the first, that an arm may be pushed off before lowering is abandoned."""
 
 LYING_RAD = 0.06
 """If every joint is within this angle of the rest pose [rad], the arm counts as resting in it."""
@@ -46,7 +46,7 @@ that exceeds this and still speeds up although its torque opposes the motion cou
 """
 
 TOO_FAST = 0.6
-"""Velocity of such a joint, relative to its limit, above which torque is cut without a test."""
+"""Velocity, relative to the limit, above which torque is cut without a test if a joint seems not to obey its motor."""
 
 _GROWS_S = 0.015
 _ROOM_RAD = 0.2  # beyond the position limits and the path home
@@ -212,7 +212,7 @@ class Lowering:
             self._look_at_obedience(index, state)
 
     def _look_at_distance(self, joint: int, away: float) -> None:
-        """Judge a joint that is `away` [rad] from its path: one that was pushed gets a new path home."""
+        """Check a joint that is `away` [rad] from its path; if it was pushed, plan a new path home."""
         pushed = self._obedience.is_pushed(joint)
         self.needs_another_path = pushed and self._paths < MOST_PATHS
         if not self.needs_another_path:

@@ -1,4 +1,4 @@
-"""Correction of steps in a position reading while an arm is lowered: a joint cannot jump, but its reading can.
+"""Correction of steps in a position reading while an arm is being lowered: a joint cannot jump, but its reading can.
 
 A reading that is far from the position predicted from the previous position and the velocities counts as false: from
 then on, the difference is subtracted. A joint whose readings step again and again is no longer corrected.
@@ -14,7 +14,8 @@ STEP_RAD = 0.04
 """Smallest step [rad]; smaller ones are left to the feedback."""
 
 BENDS_RAD_S2 = 200.0
-"""Largest joint acceleration assumed while an arm is lowered [rad/s^2]; it determines how uncertain predictions are."""
+"""Largest joint acceleration assumed while an arm is being lowered [rad/s^2]; it sets the uncertainty of predictions.
+"""
 
 MOST_STEPS = 6
 """Largest number of corrected steps per joint; a single false reading causes two."""
@@ -56,7 +57,7 @@ class PositionSteps:
 
 
 def _is_step(seen: _Seen, position: float, now: _Seen) -> bool:
-    """Whether a joint could reach a position neither by moving at its velocities nor by standing still."""
+    """Whether a joint could have reached a position neither by moving at its velocities nor by standing still."""
     seconds = now.time - seen.time
     way = 0.5 * seconds * (seen.velocity + now.velocity)
     unsure = STEP_RAD + 0.5 * BENDS_RAD_S2 * seconds**2

@@ -118,9 +118,9 @@ class WayDown:
         self._told(error, f"The arm {done}.")
 
     def _is_silent_too_long(self, latest: State, whole: State) -> bool:
-        """Whether replies have been missing for longer than lowering can do without them.
+        """Whether replies have been missing for longer than lowering can tolerate.
 
-        At most one packet is sent to find out, since each one feeds the watchdog of a servo that has another ID now.
+        At most one packet is sent to find out, since each one feeds the watchdog of a servo that now has another ID.
         """
         since = self._clock.now() - whole.time_before_write
         if since <= BRIDGED_ALONE_S or since > BRIDGED_S:
@@ -219,7 +219,7 @@ class WayDown:
             raise SafetyStop(f"{new[0].title} raised its alert, and a servo has lost its torque.", Cause.ALERT)
 
     def _look_for_another_master(self, due: float) -> None:
-        """If a read-back is due, do it just before the exchange that is due at `due` [s]."""
+        """If a read-back is due, perform it just before the exchange due at `due` [s]."""
         if self._bus.prepared.read_back_at <= due:
             read_back(self._bus, self._guard, due)
 

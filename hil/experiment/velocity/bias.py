@@ -1,10 +1,10 @@
 """Bounds on the bias of a servo's velocity reading, inferred from its positions.
 
-With a bias, as of a register that is rounded downwards, the position departs from the integral of the velocity in
-proportion to the time in motion, as a creeping position does. But a servo's bias is constant: initially it may be plus
-or minus half a step, and every sample of a run narrows this range, since position and integral cannot be farther apart
-than bias times time plus known errors. Creep that begins later leaves the range and cannot widen it. If twice these
-errors do not explain the distance, the position creeps.
+With a bias, as from a register rounded downwards, the position departs from the integral of the velocity in proportion
+to the time in motion, as it does if it creeps. But a servo's bias is constant: initially it may be plus or minus half a
+step, and every sample of a run narrows this range, since position and integral cannot be farther apart than bias times
+time plus known errors. Creep that begins later leaves the range and cannot widen it. If twice these errors do not
+explain the distance, the position creeps.
 """
 
 from typing import Any

@@ -29,11 +29,11 @@ LEAST_INFORMATION = 0.1
 """Smallest integral of the squared change of velocity, excluding what a scale error explains [rad^2/s]."""
 
 ENOUGH_INFORMATION, ALL_INFORMATION = 0.3, 3.0
-"""Values of that integral over the whole run at which lag and scale error become known, and at which they are frozen.
+"""Integrals as in `LEAST_INFORMATION`, over the whole run, at which lag and scale error become known, and are frozen.
 """
 
 SEPARATE = 0.05
-"""Smallest fraction of that integral at which lag and scale error can be distinguished."""
+"""Fraction of the squared change of velocity that a scale error must leave unexplained to be distinct from a lag."""
 
 LONGEST_S = 0.015
 """Longest interval between two samples over which the velocity is known well enough [s]."""
