@@ -9,8 +9,8 @@ NEVER = 1 << 62
 class Turns:
     """Counts cycles until spans other than the usual one are due.
 
-    A cycle only decrements the number of usual cycles returned by `plan`, from which `count` derives how many have
-    passed.
+    `plan` returns the number of usual cycles that remain until then. In each cycle, the caller only decrements this
+    number, from which `count` derives how many cycles have passed.
 
     slow_spans: number of slow spans. slow_every: samples between two slow reads. status_every: cycles between two
     status reads.
@@ -22,9 +22,9 @@ class Turns:
         self._status_every = self._until_status = status_every
         self._slow = 0
         self.usual = 0
-        """Number of planned cycles with the usual span that are not yet counted."""
+        """Number of planned cycles with the usual span that have not yet been counted."""
         self.between = 0
-        """Number of cycles between two samples that are not yet counted."""
+        """Number of cycles since the previous sample that have not yet been counted."""
 
     def count(self, left: int) -> None:
         """Count the cycles run so far. left: number of planned cycles not yet run (-1: one more was run)."""

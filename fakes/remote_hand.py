@@ -1,4 +1,4 @@
-"""Access through a socket to the hand of a fake arm that another process serves on a terminal.
+"""Socket access to the simulated hand that moves a fake arm, which another process serves on a terminal.
 
 A request is the text `move ID:to=ANGLE,...`, `release ID` or `release`; the reply is empty, or the error message.
 """

@@ -84,7 +84,7 @@ class TorqueOff:
         )
 
     def with_later(self, joint: Joint, *, rebooted: bool | None) -> "TorqueOff":
-        """Return the report after an unconfirmed joint's servo has answered again and been read back as off.
+        """Return the report with a joint confirmed whose servo has answered again and reads back as off.
 
         rebooted: result of `was_rebooted`.
         """

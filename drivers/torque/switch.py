@@ -157,7 +157,7 @@ class TorqueSwitch:
         return self.torque_off_report
 
     def shorten_watchdogs(self, seconds: float) -> None:
-        """Shorten the armed Bus Watchdogs to `seconds` [s], if they are longer, until torque is off.
+        """Until torque is off, reduce the timeouts of the armed Bus Watchdogs to `seconds` [s] where they are longer.
 
         Nothing is read back: a servo that misses the packet keeps its previous timeout.
         """

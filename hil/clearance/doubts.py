@@ -46,7 +46,7 @@ def near_by_design(space: Space) -> Iterator[str]:
 
 
 def _same_direction(config: Config, joint: JointConfig) -> str:
-    """Warn if both servos of a joint have the same direction setting, which is rarely right; otherwise return ""."""
+    """Return a warning if both servos of a joint have the same direction, which is rarely right; otherwise ""."""
     if len(joint.ids) == 1 or len(set(joint.directions)) > 1:
         return ""
     (first, second), sign = joint.ids, joint.direction

@@ -62,7 +62,7 @@ class LoweringForeseen:
 
 @dataclass(frozen=True)
 class ChainStops:
-    """The hardest fall and the lowering, over all simulated stops of a plan."""
+    """The hardest fall and the hardest lowering of the arm in any simulated stop of a plan."""
 
     fall: Fall
     lowering: LoweringForeseen

@@ -151,7 +151,7 @@ class Stream:
 
     @property
     def state(self) -> State | None:
-        """The latest state, including states read between two samples."""
+        """The latest state read, even if it was read between two samples."""
         return self._state
 
     def run(self) -> None:

@@ -197,7 +197,7 @@ def _model(model: ArmModel, names: tuple[str, ...], row: Array, factor: float) -
 
 
 def _write_table(source: Source, drawn: Drawn, path: Path) -> None:
-    """Write one row per arm: parameters, torque factor, and actuator properties under the names of Isaac Lab."""
+    """Write one row per arm: parameters, torque factor, and actuator properties, named as in Isaac Lab."""
     try:
         import pyarrow as pa
         from pyarrow import parquet

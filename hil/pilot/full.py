@@ -27,7 +27,7 @@ def identify_in_steps(
 ) -> tuple[str, SettledResult]:
     """Identify an arm from link lengths alone, or from an `earlier` result for the same arm.
 
-    Returns the sentence about the torque state and the result.
+    Returns two values: the sentence about the torque state, and the result.
 
     Raises the same errors as a run, and ExperimentError if a joint does not move at its current limit.
     """

@@ -18,7 +18,7 @@ from hil.plan.recent_motion import RecentMotion
 FULL_AT = 0.5
 """Fraction of the velocity limit at which the brake uses the full current limit.
 
-A stronger brake hardly stops the arm sooner, and throws it back farther if the connection is lost.
+A stronger brake stops the arm hardly any sooner, and throws it back farther if the connection is lost.
 """
 
 LIGHTEST = 0.5

@@ -100,7 +100,7 @@ def _set_id(servo: Servo, confirm: Confirm, new_id: int) -> tuple[Change, Servo]
     renamed = Servo(servo.port, new_id, servo.table)
     if _answers(renamed):
         raise WrongSetting(
-            f"ID {new_id} is taken: another servo answers there. Two servos with the same ID reply at once."
+            f"ID {new_id} is taken: another servo answers there. Replies of two servos with the same ID would collide."
         )
     if not confirm(f"{servo.title}: change its ID from {servo.id} to {new_id}?"):
         return Change("ID", servo.id, new_id, False), servo

@@ -58,8 +58,10 @@ def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[
 def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -> tuple[str, ...]:
     """Return the names of the lagging back-EMFs that would cancel more inertia than the simulation allows.
 
-    The limit biases the estimated inertias. A back-EMF is named only if its loss exceeds the standard error of a base
-    parameter. std: standard errors of the base parameters; those of other parameters may follow.
+    This limit biases the estimated inertias. A back-EMF is named only if the inertia that it would cancel exceeds the
+    standard error of a base parameter.
+
+    std: standard errors of the base parameters; those of other parameters may follow.
     """
     generating = _generating(base.chain.joints, parameters)
     most, parts = _most_lost(base, parameters, generating)

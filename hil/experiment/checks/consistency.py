@@ -82,8 +82,8 @@ STEPS, STEPS_S = 4, 0.5
 """Number of jumps that counts as a fault, and the longest time between them [s]."""
 
 BLOCK_S = 0.0099
-"""Shortest interval between two stored values of the distance covered under an unchanged velocity [s]. The latest three
-values span `LAG_S`.
+"""Shortest interval between two stored values of the distance covered while the velocity reading is unchanged [s]. The
+latest three values span `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
