@@ -36,7 +36,6 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.drawn_arms.population_arms import DrawnArm, draw
 from benchmarks.drawn_arms.population_others import draw as draw_other
@@ -45,6 +44,7 @@ from hil.config.schema import Config, parse_config
 from hil.dry_run.ensemble import prior_ensemble
 from hil.dry_run.stopping_distance import beyond_when_passed
 from hil.estimation.truth import true_parameters
+from hil.estimator.arrays import Array
 from hil.fakes.plants.arm import base_parameters
 from hil.plan.plan import make_plan
 from hil.runs.recording import Phase, load_samples
@@ -183,7 +183,7 @@ def _truth(config: Config, folder: Path) -> dict[str, float]:
     assert truth is not None and config.fake is not None
     samples = load_samples(folder / "samples.npy", len(config.joints))
     phase, segment, period = (samples[name].astype(np.int64) for name in ("phase", "segment", "period"))
-    written: NDArray[np.float64] = samples["time_before_write"]
+    written: Array = samples["time_before_write"]
     played = (phase == Phase.PERIODIC) & (segment == 0)
     # Only the last periods of the multisine are fitted, once the motion has settled.
     fitted = played & (period > period[played].max() - config.experiment.periods)

@@ -20,15 +20,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 import hil
 from benchmarks.machine import machine
+from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled, inner
 
-Values = NDArray[np.float64]
 LAWS = ("delay", "lag", "logged")
 STEP_S = 2e-5
 SECONDS = {100: 40.0, 200: 20.0, 500: 12.0}
@@ -50,8 +49,8 @@ class Arm:
     [kg m^2], gravity [m/s^2]. friction (2, 6): viscous, Coulomb, width, Stribeck rise, its velocity, share of load.
     """
 
-    links: Values
-    friction: Values
+    links: Array
+    friction: Array
 
     def truth(self) -> dict[str, float]:
         """The parameters' values, by the names in result.json [SI units]."""
@@ -82,7 +81,7 @@ def drawn_arm(random: np.random.Generator) -> Arm:
     return Arm(links, random.uniform(low, high, (2, 6)))
 
 
-def drawn_torque(random: np.random.Generator, arm: Arm, rate: int) -> Values:
+def drawn_torque(random: np.random.Generator, arm: Arm, rate: int) -> Array:
     """Ten sines between 0.15 and 4 Hz for each joint, about as strong as its weight (2, samples) [N m]."""
     time_s = np.arange(round(SECONDS[rate] * rate)) / rate
     truth = arm.truth()
@@ -96,14 +95,14 @@ def drawn_torque(random: np.random.Generator, arm: Arm, rate: int) -> Values:
 
 
 @inner
-def _loss(velocity: float, torque: float, law: Values) -> float:
+def _loss(velocity: float, torque: float, law: Array) -> float:
     viscous, coulomb, width, rise, decay, load = law
     level = coulomb * (1.0 + rise * np.exp(-((velocity / decay) ** 2))) + load * abs(torque)
     return float(viscous * velocity + level * np.tanh(velocity / width))
 
 
 @inner
-def _rates(state: Values, torque: Values, links: Values, friction: Values) -> Values:
+def _rates(state: Array, torque: Array, links: Array, friction: Array) -> Array:
     """Derivative of joint angles and velocities, from Lagrange's equations in the links' absolute angles."""
     m1, m2, elbow, length, c1, c2, j1, j2, armature_1, armature_2, g = links
     angle, turned = state[0], state[0] + state[1]
@@ -123,7 +122,7 @@ def _rates(state: Values, torque: Values, links: Values, friction: Values) -> Va
 
 
 @compiled
-def _motion(command: Values, interval: float, late: Values, links: Values, friction: Values) -> Values:
+def _motion(command: Array, interval: float, late: Array, links: Array, friction: Array) -> Array:
     """Positions at every command (2, samples) [rad], hanging at first; each command is held.
 
     late (3, 2): delay and lag of each joint's torque, and by how much later its position is logged [s].

@@ -56,6 +56,7 @@ from benchmarks.fault_campaign.judge import (
 )
 from hil.clearance.space import Space
 from hil.config.schema import Config
+from hil.estimator.arrays import Array
 from hil.plan.way_home import WayHome
 
 NAMES = ("fake_open_manipulator_x", "fake_viperx_300")
@@ -184,7 +185,7 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
     reasons = reasons_of(config, drawn, story, ready.undisturbed, told)
     time, driven = record["time"][:, 0], np.asarray(record["driven"].any(axis=1))
     low, high = np.array([joint.position_limit for joint in config.joints]).T
-    position: NDArray[np.float64] = record["position"]
+    position: Array = record["position"]
     moved = position[driven] if driven.any() else position[:1]
     unheard = bool(set(drawn.kinds) & UNHEARD)
     cut_ms = max(BOUND_MS, 1e3 * config.safety.watchdog + TRIP_MS) if unheard else BOUND_MS
@@ -270,9 +271,7 @@ def _undisturbed_clearance(setting: Setting) -> float:
     return _clearance(ready.config, ready.undisturbed.record)
 
 
-def _without_held(
-    config: Config, position: NDArray[np.float64], time: NDArray[np.float64], drawn: Drawn | None
-) -> NDArray[np.float64]:
+def _without_held(config: Config, position: Array, time: Array, drawn: Drawn | None) -> Array:
     """The poses (joints, times) [rad], with joints that something holds by force at their rest angles meanwhile."""
     free = position.copy()
     for attack in drawn.attacks if drawn else ():
@@ -284,7 +283,7 @@ def _without_held(
     return free
 
 
-def _lies(config: Config, position: NDArray[np.float64]) -> bool:
+def _lies(config: Config, position: Array) -> bool:
     return bool(np.abs(position - np.array(config.arm.rest_pose)).max() < LIES_RAD)
 
 

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import hil
 from hil.clearance.space import Space
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.estimator.arrays import Array
 from hil.fakes.servo.registers import load_model
 from hil.plan.chain_model import known_chain
 from hil.runs.recording import Phase, load_samples
@@ -73,7 +73,7 @@ def measured(config: Config, run: Path) -> dict[str, float]:
     seconds, nearest, excess = 0.0, np.inf, -np.inf
     for path in run.rglob("samples.npy"):
         samples = load_samples(path, len(config.joints))
-        position: NDArray[np.float64] = samples["position"]
+        position: Array = samples["position"]
         q = position[np.isfinite(position).all(axis=1)].T
         seconds += float(samples["deadline"][-1] - samples["deadline"][0])
         away = q[:, ~space.lies(q)][:, ::4]

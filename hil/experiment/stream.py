@@ -14,7 +14,6 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
@@ -23,6 +22,7 @@ from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
+from hil.estimator.arrays import Array
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.estimator.data.periodicity import correlation_of_changes, decay_of
 from hil.experiment.chain_watch import ChainWatch
@@ -335,7 +335,7 @@ class Stream:
         window = rest_window(self._plan.rate)
         for _ in range(0, self._plan.end_samples, window):
             self._play(self._silence(window), Phase.COMING_TO_REST)
-            velocity: NDArray[np.float64] = self._recorder.samples["velocity"]
+            velocity: Array = self._recorder.samples["velocity"]
             speeds = np.abs(velocity[-window:])
             # Missing replies are ignored; a joint without any reply does not count as being at rest.
             fastest = np.fmax.reduce(speeds, axis=0)
@@ -357,7 +357,7 @@ class Stream:
             state = self._play(self._silence(window), Phase.COMING_TO_REST)
         self._note("the arm is not balanced: without torque, friction may not hold it upright")
 
-    def _play(self, goals: NDArray[np.float64], phase: Phase, period: int = -1) -> State:
+    def _play(self, goals: Array, phase: Phase, period: int = -1) -> State:
         """Send goal currents (samples, joints) [A], one row per tick; return the last state."""
         state = missed(self._goal, self._bus.port.clock.now())
         for row in goals:  # row by row: converting a long period at once would delay the loop
@@ -426,7 +426,7 @@ class Stream:
                     self._bus.shorten_watchdogs(_BRAKING_WATCHDOG_S)
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
 
-    def _silence(self, samples: int) -> NDArray[np.float64]:
+    def _silence(self, samples: int) -> Array:
         return np.zeros((samples, len(self._bus.joints)))
 
     def _moving(self, state: State) -> str:

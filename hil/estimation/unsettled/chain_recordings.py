@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.chain import doubted_inertias
 from hil.config.recording import RecordingConfig
@@ -17,6 +16,7 @@ from hil.errors import ConfigError
 from hil.estimation.chain_estimate import chain_facts, vague
 from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
 from hil.estimation.unsettled.chain_slips import late_torque, refuse_chain_slips, torques_apart
+from hil.estimator.arrays import Array
 from hil.estimator.chain.column_faults import ColumnCheck
 from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.base_parameters import BaseParameters
@@ -30,8 +30,6 @@ from hil.estimator.models.bounds import bound_sentence
 from hil.estimator.models.conflicts import Trust, conflict_sentences, contradicted, lowered
 from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Validation, Verdict
 from hil.results.result import ShootingResult
-
-Array = NDArray[np.float64]
 
 FITTED_SHARE = 0.75  # of each recording, for the check on the rest
 EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.chain import only_planar
 from hil.config.experiment import ModelConfig
@@ -22,6 +21,7 @@ from hil.estimation.unsettled.angle_scale import angle_scale
 from hil.estimation.unsettled.causes import Fitted, are_known, causes
 from hil.estimation.unsettled.plausibility import implausible, undetermined
 from hil.estimation.unsettled.warnings import Doubts, doubts_of
+from hil.estimator.arrays import Array
 from hil.estimator.baselines.idim import fit_inverse_dynamics
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
@@ -54,7 +54,7 @@ class Estimated:
     """
 
     result: ShootingResult
-    predicted: tuple[NDArray[np.float64], ...]
+    predicted: tuple[Array, ...]
     estimate: ShootingEstimate
 
 
@@ -85,8 +85,8 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
     only_planar(config, "an estimate from all samples")
     samples = load_samples(run.samples_path, len(config.joints))
     constants = np.array([joint.torque_per_goal for joint in config.joints])
-    written: NDArray[np.float64] = samples["time_before_write"]
-    goals: NDArray[np.float64] = samples["goal_current"]
+    written: Array = samples["time_before_write"]
+    goals: Array = samples["goal_current"]
     recording = Recording(
         written - written[:1],
         (goals * constants).T,
@@ -152,9 +152,7 @@ def estimate_any(
     return Estimated(result, predicted, estimate)
 
 
-def _judged(
-    fitted: Fitted, given: Given, why: tuple[str, ...], held_out: NDArray[np.float64] | None, found: Doubts
-) -> Verdict:
+def _judged(fitted: Fitted, given: Given, why: tuple[str, ...], held_out: Array | None, found: Doubts) -> Verdict:
     """The verdict. why: sentences about defects of the recordings."""
     recordings, estimate = fitted.recordings, fitted.estimate
     conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
@@ -200,7 +198,7 @@ def joint_names(count: int) -> tuple[str, ...]:
     return tuple(f"joint {joint}" for joint in range(1, count + 1))
 
 
-def _start(recordings: Sequence[Recording]) -> NDArray[np.float64]:
+def _start(recordings: Sequence[Recording]) -> Array:
     """Base parameters from inverse dynamics, filtered as lightly as the recordings' rate and length allow."""
     for cutoff in START_CUTOFFS[:-1]:
         try:
@@ -211,8 +209,8 @@ def _start(recordings: Sequence[Recording]) -> NDArray[np.float64]:
 
 
 def _fitted(
-    recordings: Sequence[Recording], wanted: ModelConfig, start: NDArray[np.float64], segment: float, zeros: bool
-) -> tuple[ShootingEstimate, SegmentChoice | None, NDArray[np.float64] | None]:
+    recordings: Sequence[Recording], wanted: ModelConfig, start: Array, segment: float, zeros: bool
+) -> tuple[ShootingEstimate, SegmentChoice | None, Array | None]:
     if wanted.friction == "auto":
         choice = choose_by_shooting(
             recordings, wanted.drive, start, length=segment, zeros=zeros, torque_scale=wanted.torque_scale

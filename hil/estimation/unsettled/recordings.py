@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.arm_model import JointFacts
 from hil.config.csv_columns import Columns
@@ -20,6 +19,7 @@ from hil.estimation.slips.recorded_jumps import jump_sentences
 from hil.estimation.unsettled.chain_recordings import estimate_chain_recordings
 from hil.estimation.unsettled.estimate import Estimated, Given, estimate_any
 from hil.estimation.unsettled.slips import refuse_slips, refuse_stuck
+from hil.estimator.arrays import Array
 from hil.estimator.baselines.zero import turned_zeros
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import ConvergenceError, RecordingError
@@ -229,7 +229,7 @@ def _keep(
     config_path: Path | None,
     config: RecordingConfig,
     read: Converted,
-    predicted: Sequence[NDArray[np.float64]],
+    predicted: Sequence[Array],
 ) -> None:
     kept = [
         Predicted(name, each.time, each.torque, each.position, motion)
