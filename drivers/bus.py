@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from hil.drivers.control_table import load_control_table, model_names
 from hil.drivers.errors import NoReply, ServoFault, WrongModel, WrongReply
-from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
 from hil.drivers.others.heard import MOST_MIXED_UP, MOST_STRANGERS
 from hil.drivers.packet import ALERT
@@ -20,6 +19,7 @@ from hil.drivers.preparation.prepare import (
     prepare_servo,
 )
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
+from hil.drivers.read_back_exchange import ReadBackExchange
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
 from hil.drivers.state import NAN, SETTINGS, Converter, State, fold, read_back_spans, spans
@@ -88,7 +88,7 @@ class ServoBus(TorqueSwitch):
         self._in_pairs = len(self._drives) > len(self.joints)
         self._measured = self._drives
         """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
-        self._exchange: Exchange | None = None
+        self._exchange: ReadBackExchange | None = None
         self.exchanges_per_sample = 1
         """Number of exchanges per sample, set by `prepare`: they are at most CHECK_S apart if the bus is fast enough.
         """
@@ -221,7 +221,7 @@ class ServoBus(TorqueSwitch):
         self.add_read_back(exchange)
         self._exchange = exchange
 
-    def add_read_back(self, exchange: Exchange) -> None:
+    def add_read_back(self, exchange: ReadBackExchange) -> None:
         """Make `exchange` read back the servos' goals, Torque Enable and settings; expect the present settings."""
         modes = [drive.mode for drive in self._drives]
         settings = [[servo.read(name) for name in SETTINGS] for servo in self._servos.values()]
@@ -239,7 +239,7 @@ class ServoBus(TorqueSwitch):
         slow_every: int | None = None,
         status: bool = True,
         patience: float = 0.0,
-    ) -> Exchange:
+    ) -> ReadBackExchange:
         """Return an exchange with these servos, after reading their Return Delay Times.
 
         fast: use Fast Sync Read instead of Sync Read.
@@ -256,7 +256,7 @@ class ServoBus(TorqueSwitch):
             cadence(self.config.interval, self.port, self._drives, tables, return_delay) if status else (1, None, 0)
         )
         self.exchanges_per_sample = every
-        return Exchange(
+        return ReadBackExchange(
             self.port,
             [servo.id for servo in servos],
             [
@@ -276,7 +276,7 @@ class ServoBus(TorqueSwitch):
         )
 
     @property
-    def prepared(self) -> Exchange:
+    def prepared(self) -> ReadBackExchange:
         """The prepared exchange; raises RuntimeError if `prepare` has not been called."""
         if self._exchange is None:
             raise RuntimeError("ServoBus.prepare has not been called")

@@ -24,16 +24,6 @@ from fastcrc import crc16
 
 from hil.drivers.control_table import Register
 from hil.drivers.others.heard import Heard
-from hil.drivers.others.read_back import (
-    GOALS,
-    OVERTIME_SHARE,
-    REMEMBERED,
-    TORQUE,
-    TRY_AGAIN_S,
-    Overruled,
-    ReadBack,
-    pause_after,
-)
 from hil.drivers.packet import BROADCAST_ID, HEADER, Instruction
 from hil.drivers.port import Port, ReplyTime
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
@@ -53,8 +43,8 @@ AFTER_LOSS = 5
 many cycles late is recognised by its length.
 """
 
-_LATE_SHARE = 0.25
-"""Fraction of `Exchange._overtime` by which the reply to any read-back may be late."""
+REMEMBERED = 128
+"""Number of recent goals that a servo may still hold until the status detects that writes are lost."""
 
 _LONGEST_REPLY = 1024
 _DOUBTS = 3
@@ -160,16 +150,9 @@ class Exchange:
         self._took = math.inf
         """Duration of the latest cycle [s]."""
         self._usual = self._latest_plan = self._plans[0]
-        self._read_back: ReadBack | None = None
         self._interval = interval
         shown = () if status is None else one_each(status, len(self.ids))[0].registers
         self._shows_torque = "Torque Enable" in shown
-        self._overtime = 0.0 if self._shows_torque else OVERTIME_SHARE * interval
-        """Longest time by which a read-back may delay the next cycle [s]; 0 if the status includes Torque Enable."""
-        self.awaited_until = -math.inf
-        """Reply deadline of the latest repeated read-back, which may delay the next cycle [s on the port's clock]."""
-        self.read_back_at = math.inf
-        """When to call `overruled` again, before the next cycle [s on the port's clock]."""
 
     @property
     def command_to_sample(self) -> float:
@@ -217,178 +200,6 @@ class Exchange:
         self._turns.count(self._usual_left)
         self._turns.read_status_next()
         self._usual_left = self._turns.plan()
-
-    def add_read_back(
-        self,
-        goal: Span | Sequence[Span],
-        mode: Span | Sequence[Span],
-        torque: Span | Sequence[Span],
-        modes: Sequence[Sequence[int]],
-    ) -> None:
-        """Prepare the read-backs made by `overruled` (see `ReadBack`).
-
-        goal: spans of Bus Watchdog and goal. mode: spans that end with the settings, whose values are `modes`. torque:
-        spans that begin with Torque Enable.
-        """
-        back = self._read_back = ReadBack(
-            *(self.ids, goal, mode, modes, torque),
-            watches_torque=not self._shows_torque,
-            interval=self._interval,
-            fast=self.fast,
-        )
-        self._wire_s |= {read: self._port.wire_time(len(read.request) + read.reply_size) for read in back.every}
-        self.heard.expect(back.every)
-        self.read_back_at = -math.inf
-
-    @property
-    def is_in_doubt(self) -> bool:
-        """Whether a read-back has recently found a value that this program did not write."""
-        return self._read_back is not None and self._now() < self._read_back.doubts_until
-
-    @property
-    def sighted(self) -> Overruled | None:
-        """A recently read-back value that this program did not write; None if there is none."""
-        return self._read_back.sighted if self._read_back is not None and self.is_in_doubt else None
-
-    @property
-    def modes_seen_ago(self) -> float:
-        """Time since all servos were last confirmed to be in their modes [s]; infinite if they never were."""
-        return math.inf if self._read_back is None else self._now() - self._read_back.modes_seen_at
-
-    @property
-    def watchdogs(self) -> Sequence[tuple[int, int]]:
-        """Index and Bus Watchdog of each servo in the latest read-back of goals."""
-        return () if self._read_back is None else self._read_back.watchdogs
-
-    @property
-    def torque_off(self) -> int | None:
-        """Index of a servo whose Torque Enable was last read back as 0; None if there is none."""
-        return None if self._read_back is None else self._read_back.torque_off
-
-    def read_torque(self) -> int | None:
-        """Read Torque Enable of all servos now, outside a cycle; return the same as `torque_off`. Raises PortLost."""
-        back = self._read_back
-        if back is not None and not self._late_possible:
-            back.kind, now = TORQUE, self._now()
-            back.look(self._ask_back(back.read, now, self._usual.reply_time.timeout), self._sent, now)
-        return self.torque_off
-
-    def read_back_every(self, off_wire: float) -> tuple[float, float]:
-        """Return the expected time between two read-backs of a goal [s] (0 if most cycles leave time for one), and the
-        duration of the shortest cycle that leaves time for one [s].
-
-        off_wire: duration of an exchange in addition to its wire time [s].
-        """
-        back = self._read_back
-        if back is None or not self._interval:
-            return 0.0, 0.0
-        fixed = self._usual.wire_s + 2.0 * off_wire
-        goals = self._wire_s[back.reads[GOALS]]
-        shortest = fixed + min(goals, self._wire_s[back.shortest])
-        if shortest <= self._interval:
-            return 0.0, shortest
-        delay = fixed + goals - self._interval
-        return 2.0 * pause_after(delay) if delay <= self._overtime else math.inf, shortest
-
-    @property
-    def lost(self) -> Overruled | None:
-        """A servo that, according to read-backs, has missed many of the latest goals; None if there is none."""
-        return self._read_back.lost if self._read_back is not None else None
-
-    def overruled(self, due: float) -> Overruled | None:
-        """Read back goals, settings or Torque Enable if there is time before the next cycle, due at `due` [s].
-
-        The next cycle overwrites another master's goals before its own replies are sampled, so only what the servos
-        hold right before a cycle shows who commands them. Missing replies are ignored here; the next cycle detects
-        them.
-
-        Returns a value that only another master can have written, or None. Raises PortLost.
-        """
-        back = self._read_back
-        if back is None or not self._sent:
-            return None
-        if back.kind != GOALS:
-            # Only goals are overwritten by the next cycle. If there is time for them as well, they are read last.
-            before_goals = due - self._takes(back.reads[GOALS], back) - HOST_S
-            if self._now() + self._takes(back.read, back) <= before_goals:
-                found = self._held(back, before_goals)
-                if found is not None or back.kind != GOALS:
-                    return found
-        return self._held(back, due)
-
-    def _takes(self, read: GroupRead, back: ReadBack) -> float:
-        """Return the longest time that a read-back is expected to take [s]."""
-        off_wire = self._took - self._latest_plan.wire_s
-        return self._wire_s[read] + max(off_wire, back.longest)
-
-    def _held(self, back: ReadBack, due: float) -> Overruled | None:
-        """Read back once if this is possible before `due` [s], or slightly later if a read-back is overdue.
-
-        If there is no time for all servos, only one is read.
-        """
-        port, now, read = self._port, self._now(), back.read
-        takes = self._takes(read, back)
-        alone = now + takes > due >= now + self._takes(back.alone, back)
-        if alone:
-            read, takes = back.alone, self._takes(back.alone, back)
-        end = due + self._overtime if now + takes > due and now >= back.overdue_at else due
-        if now + takes > end or self._late_possible:
-            back.postponed(now)
-            if back.kind != GOALS and not self._late_possible and now + self._takes(back.shortest, back) <= due:
-                back.kind = GOALS  # which take less time; what is due remains due
-                return self._held(back, due)
-            back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
-            left_less_time = self._latest_plan is not self._usual
-            self.read_back_at = now if self._late_possible or left_less_time else now + TRY_AGAIN_S
-            return None
-        port.clock.wait_until(due - takes - HOST_S)
-        before = self._now()
-        if before + takes > end:  # woken up late
-            self.read_back_at = before + TRY_AGAIN_S
-            return None
-        # Where there is hardly enough time, a reply that comes a little late is not lost.
-        servos = self._ask_back(read, before, max(end - before, takes + _LATE_SHARE * self._overtime))
-        now = self._now()
-        if now > due:
-            self.awaited_until = now
-        # Where nothing at all arrived, the reply may be late, and another one would be mistaken for it.
-        if None in servos and self.heard.latest and back.may_repeat(now, takes):
-            # The packet of another master may have destroyed the reply, and the next cycle overwrites what it wrote.
-            self.awaited_until = now + takes + self._wire_s[read]
-            servos = self._ask_back(read, now, self.awaited_until - now)
-        self.read_back_at = now
-        if None in servos:
-            self._expect_late()
-            if not self.is_in_doubt:
-                self.read_back_at = now + TRY_AGAIN_S  # a late reply costs the next cycle time
-        else:
-            back.took(min(now - before, 2.0 * takes) - self._wire_s[read])
-        if alone:
-            servos = [servos[0] if at == back.place else None for at in range(len(self.ids))]
-        found = back.look(servos, self._sent, now, collided=self._latest_plan.is_after_loss, alone=alone)
-        back.delayed(now, max(0.0, now - due), alone=alone)
-        if back.is_unexpected:
-            self.read_status_next()  # it distinguishes lost goals from another master's
-        return found
-
-    def _ask_back(self, read: GroupRead, start: float, timeout: float) -> list[Answer]:
-        """Send the read at `start` [s]; return the answers that arrive within `timeout` [s]."""
-        port = self._port
-        expected = port.reply_time(timeout, len(read.request))
-        if self._echoes:
-            received = port.ask(read.request, len(read.request) + read.reply_size, expected, start)
-            received = received.removeprefix(read.request)
-        else:
-            received = port.ask(read.request, read.reply_size, expected, start)
-        if port.overheard:
-            self._overhear()
-        self.heard.latest = received
-        servos = read.unpack(received)
-        if servos is None:
-            # A master that writes between two cycles is heard here, and nowhere else if the next reply is complete.
-            servos = read.search(received)[0]
-            self.heard.beside(received, echoes=self._echoes)
-        return servos
 
     def cycle(self, goal_ticks: Sequence[int], *, between: bool = False) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.

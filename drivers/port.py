@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 
 import serial
 
-from hil.drivers.clock import Clock, WallClock
-from hil.drivers.device import (
+from hil.drivers.adapter.device import (
     adapter_name,
     device_of,
     is_pseudo_terminal,
@@ -24,8 +23,9 @@ from hil.drivers.device import (
     other_users,
     true_baud,
 )
+from hil.drivers.adapter.latency import WANTED_MS, adapter_latency, latency_timer, read_latency_ms, write_latency_ms
+from hil.drivers.clock import Clock, WallClock
 from hil.drivers.errors import NotPermitted, PortLost, PortNotOpened
-from hil.drivers.latency import WANTED_MS, adapter_latency, latency_timer, read_latency_ms, write_latency_ms
 
 _now = time.perf_counter
 _FAILURES = (OSError, termios.error)

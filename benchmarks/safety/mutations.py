@@ -57,7 +57,11 @@ TESTS = {
     ],
     "hil/drivers/exchange.py": [
         *("tests/drivers/test_exchange_cycles.py", "tests/drivers/test_heard_instead.py"),
-        *("tests/drivers/test_exchange.py", "tests/drivers/test_read_back.py"),
+        "tests/drivers/test_exchange.py",
+    ],
+    "hil/drivers/read_back_exchange.py": [
+        *("tests/drivers/test_read_back_exchange.py", "tests/drivers/test_exchange_cycles.py"),
+        "tests/drivers/test_read_back.py",
     ],
     "hil/drivers/others/heard.py": [
         *("tests/drivers/test_heard_instead.py", "tests/drivers/test_exchange_cycles.py"),

@@ -11,7 +11,7 @@ from hil.drivers.others.foreign_values import ForeignValues
 from hil.drivers.packet import ALERT
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
 
-__all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack", "pause_after"]
+__all__ = ["TRY_AGAIN_S", "Overruled", "ReadBack", "pause_after"]
 
 GOALS, MODES, TORQUE = range(3)
 """What is read back, as indices of `ReadBack.reads`."""
@@ -28,9 +28,6 @@ _GOALS_PER_OTHER_IN_DOUBT = 4
 
 _RECENT = 4
 """Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
-
-REMEMBERED = 128
-"""Number of recent goals that a servo may still hold until the status detects that writes are lost."""
 
 _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Numbers of read-backs of a foreign value that prove another writer, and the time within which they must occur [s].

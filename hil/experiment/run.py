@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from hil import fakes
 from hil.config.schema import Config
+from hil.drivers.adapter.latency import WANTED_MS, command_to_set, latency_timer, read_latency_ms
 from hil.drivers.bus import ServoBus
 from hil.drivers.clock import Clock, WallClock
 from hil.drivers.errors import DriverError, PortLost, ServoFault, TorqueNotOff, WrongSetting
-from hil.drivers.latency import WANTED_MS, command_to_set, latency_timer, read_latency_ms
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested

@@ -13,8 +13,8 @@ import numpy as np
 
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
-from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
+from hil.drivers.read_back_exchange import ReadBackExchange
 from hil.drivers.servo_model import Mode
 from hil.setup.realtime import on_time
 
@@ -102,7 +102,7 @@ def seldom_as_measured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> str:
     return seldom_read_back(bus, exchange, max(0.0, used.median_s - exchange.usual_wire_s))
 
 
-def seldom_read_back(bus: ServoBus, exchange: Exchange, off_wire: float) -> str:
+def seldom_read_back(bus: ServoBus, exchange: ReadBackExchange, off_wire: float) -> str:
     """Return a warning that cycles leave too little time to read back goals and torque regularly; "" if there is
     enough time.
 

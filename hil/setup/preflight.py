@@ -8,11 +8,11 @@ from hil import fakes
 from hil.clearance.doubts import doubts
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
+from hil.drivers.adapter.latency import FACTORY_MS, WANTED_MS, command_to_set, latency_timer, read_latency_ms
 from hil.drivers.bus import ServoBus
 from hil.drivers.control_table import model_names
 from hil.drivers.errors import BusShared, DriverError, NoReply, PortLost, PortNotOpened, WrongSetting
 from hil.drivers.joint import Joint
-from hil.drivers.latency import FACTORY_MS, WANTED_MS, command_to_set, latency_timer, read_latency_ms
 from hil.drivers.packet import MAX_ID, HardwareError
 from hil.drivers.preparation.prepare import TIME_BASED_PROFILE, check_quiet, shuts_down
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself

@@ -10,7 +10,8 @@ from hil.drivers.packet import encode_status
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import spans, status_span
 from hil.drivers.turns import Turns
-from tests.drivers.test_exchange import XM430, Wire, answer, exchange, read_back_of
+from tests.drivers.test_exchange import XM430, Wire, answer, exchange
+from tests.drivers.test_read_back_exchange import read_back_of
 
 FINE = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
 

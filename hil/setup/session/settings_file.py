@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 
-from hil.drivers.device import adapter_name
+from hil.drivers.adapter.device import adapter_name
 from hil.errors import RunFolderError
 
 SCHEMA = 1

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from hil.drivers.device import adapter_name, device_of, is_pseudo_terminal, other_users, true_baud
+from hil.drivers.adapter.device import adapter_name, device_of, is_pseudo_terminal, other_users, true_baud
 from hil.drivers.errors import PortLost, PortNotOpened
 from hil.drivers.port import open_port
 

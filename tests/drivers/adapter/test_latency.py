@@ -9,8 +9,7 @@ from typing import cast
 import pytest
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS
 
-from hil.drivers.errors import WrongReply
-from hil.drivers.latency import (
+from hil.drivers.adapter.latency import (
     FACTORY_MS,
     adapter_latency,
     command_to_set,
@@ -18,6 +17,7 @@ from hil.drivers.latency import (
     read_latency_ms,
     write_latency_ms,
 )
+from hil.drivers.errors import WrongReply
 from hil.drivers.preparation.prepare import learn_latency
 from hil.drivers.servo import Servo
 from hil.fakes.bus.clock import VirtualClock

@@ -1,0 +1,171 @@
+"""Read-backs between cycles on a scripted wire: when they take place, and what a lost or late one changes."""
+
+import struct
+
+import pytest
+
+from hil.drivers.exchange import HOST_S
+from hil.drivers.others.read_back import GOALS, LOST_OF, TRY_AGAIN_S
+from hil.drivers.packet import Framer, Instruction, encode, encode_status
+from hil.drivers.read_back_exchange import ReadBackExchange
+from hil.drivers.servo_model import Mode
+from hil.drivers.state import read_back_spans
+from hil.drivers.sync_read import Span, one_each
+from hil.drivers.turns import Turns
+from tests.drivers.test_exchange import XM430, Wire, answer, echoed, exchange
+
+ONE_READ_BACK_S = 0.004
+"""Time before a cycle that suffices for one read-back, but not for modes and goals."""
+
+
+def read_back_of(wire: Wire) -> ReadBackExchange:
+    cycles = exchange(wire)
+    modes = [Mode.CURRENT, Mode.CURRENT]
+    cycles.add_read_back(*read_back_spans(modes, [XM430, XM430]), [(0, mode, 0) for mode in modes])
+    return cycles
+
+
+def test_another_masters_instructions_before_a_read_back_are_counted() -> None:
+    wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])
+    cycles = read_back_of(wire)
+    cycles.cycle([0, 0])
+    wire.waiting = encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")
+    cycles.overruled(wire.now() + 0.1)
+    assert cycles.heard.strangers == 1
+
+
+@pytest.mark.parametrize("size", [None, 9])
+def test_another_masters_instructions_instead_of_a_read_back_are_counted(size: int | None) -> None:
+    wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])
+    cycles = read_back_of(wire)
+    cycles.cycle([0, 0])
+    assert cycles._read_back is not None
+    read = cycles._read_back.read
+    reply = b"".join(encode_status(servo, 0, bytes(read.reply_size // 2 - 11)) for servo in (1, 2))
+    wire.answers = [(encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")[:size] + reply)[: read.reply_size]]
+    cycles.overruled(wire.now() + 0.1)
+    assert cycles.heard.strangers == 1
+
+
+def test_modes_are_read_back_before_goals_if_there_is_time_for_both() -> None:
+    for available, asked in ((ONE_READ_BACK_S, [1]), (0.1, [1, 0])):
+        wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])
+        cycles = read_back_of(wire)
+        cycles.cycle([0, 0])
+        assert cycles._read_back is not None
+        reads = cycles._read_back.reads
+        sizes = [own.reply_size // 2 - 11 for own in reads]
+        wire.answers = [
+            b"".join(encode_status(servo, 0, bytes(sizes[is_of_modes])) for servo in (1, 2)) for is_of_modes in asked
+        ]
+        wire.written.clear()
+        assert cycles.overruled(wire.now() + available) is None and not cycles._late_possible
+        assert wire.written == [reads[is_of_modes].request for is_of_modes in asked]
+
+
+def test_a_lost_reply_or_a_long_cycle_delays_the_next_read_back_by_one_cycle_only() -> None:
+    fine = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+    wire = Wire([fine, b""])
+    cycles = read_back_of(wire)
+    for is_passing in (False, True):
+        cycles.cycle([0, 0])
+        before = wire.now()
+        assert cycles.overruled(before + (1e-4 if not is_passing else 0.1)) is None
+        assert cycles.read_back_at == (before if is_passing else before + TRY_AGAIN_S)
+
+
+class Held(Wire):
+    """A wire on which two servos answer every read with zeros, and at its end with the goal that they hold."""
+
+    goal, is_silent = 0, False
+
+    def write(self, data: bytes) -> None:
+        reads = [each.body for each in Framer().feed(data) if each.instruction == Instruction.SYNC_READ]
+        for body in [] if self.is_silent else reads:
+            is_of_settings = body[0] | body[1] << 8 < 64
+            told = bytes((body[2] | body[3] << 8) - 2) + struct.pack("<h", 0 if is_of_settings else self.goal)
+            self.waiting += b"".join(encode_status(servo, 0, told) for servo in (1, 2))
+
+
+@pytest.mark.parametrize("is_late", [False, True])
+def test_goals_sent_while_a_reply_is_late_may_collide_with_it_and_are_not_counted_as_missed(is_late: bool) -> None:
+    wire = Held()
+    cycles = read_back_of(wire)
+    for number in range(2 * LOST_OF):
+        wire.goal = number
+        if is_late:
+            wire.is_silent = True
+            cycles.cycle([number, number])
+            wire.is_silent = False
+        cycles.cycle([number + 1, number + 1])
+        assert cycles.overruled(wire.now() + ONE_READ_BACK_S) is None
+    assert (cycles.lost is None) is is_late
+
+
+@pytest.mark.parametrize(("doubts_until", "pause"), [(0.0, TRY_AGAIN_S), (1.0, 0.0)])
+def test_after_a_lost_reply_the_next_read_back_waits_unless_another_master_is_suspected(
+    doubts_until: float, pause: float
+) -> None:
+    fine = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+    wire = Wire([fine])
+    cycles = read_back_of(wire)
+    cycles.cycle([0, 0])
+    assert cycles._read_back is not None
+    cycles._read_back.doubts_until = doubts_until
+    assert cycles.overruled(wire.now() + ONE_READ_BACK_S) is None
+    assert cycles.read_back_at == pytest.approx(wire.now() + pause, abs=1e-9)
+
+
+@pytest.mark.parametrize(("held", "is_due"), [(0, False), (5, True)])
+def test_a_goal_that_was_not_taken_asks_for_the_status(held: int, is_due: bool) -> None:
+    wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])
+    cycles = read_back_of(wire)
+    cycles._turns = Turns(slow_spans=2, slow_every=100, status_every=20)
+    cycles._usual_left = cycles._turns.plan()
+    cycles.cycle([0, 0])
+    assert cycles._read_back is not None
+    for is_of_modes in (True, False):
+        data = bytes(cycles._read_back.read.reply_size // 2 - 13) + struct.pack("<h", 0 if is_of_modes else held)
+        wire.answers = [b"".join(encode_status(servo, 0, data) for servo in (1, 2))]
+        assert cycles.overruled(wire.now() + ONE_READ_BACK_S) is None
+    assert cycles._usual_left == (0 if is_due else 18)
+
+
+def test_goals_are_compared_with_what_was_sent_though_the_caller_changes_its_list() -> None:
+    wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)] * 30)
+    cycles = read_back_of(wire)
+    goals = [7, 8]
+    for _ in range(4):
+        cycles.cycle(goals)
+    goals[:] = [70, 80]
+    sizes = [one_each(span, 2)[0].size for span in read_back_spans([Mode.CURRENT] * 2, [XM430] * 2)]
+    assert cycles._read_back is not None
+    for _ in range(8):
+        kind = cycles._read_back.kind
+        held = (7, 8) if kind == GOALS else (0, 0)
+        answers = [b"\1" + bytes(sizes[kind] - 3) + struct.pack("<h", each) for each in held]
+        wire.answers = [b"".join(encode_status(servo, 0, each) for servo, each in enumerate(answers, 1))]
+        assert cycles.overruled(wire.now() + 1.5 * HOST_S) is None and not wire.answers
+        assert not cycles._late_possible and not cycles.is_in_doubt
+
+
+def test_a_read_back_behind_an_echo_is_read_whole() -> None:
+    wire = Wire()
+    wire.echoes = True
+    cycles = read_back_of(wire)
+    wire.answers = [echoed(wire, answer(1, 1, 2, 3) + answer(2, 4, 5, 6), [7, 8])]
+    cycles.cycle([7, 8])
+    back = cycles._read_back
+    assert back is not None and back.read is back.reads[1]
+    _, mode, _ = read_back_spans([Mode.CURRENT] * 2, [XM430] * 2)
+    assert isinstance(mode, Span)
+    wire.answers = [back.read.request + b"".join(encode_status(servo, 0, bytes(mode.size)) for servo in (1, 2))]
+    began = wire.time
+    assert cycles.overruled(began + ONE_READ_BACK_S) is None
+    assert not wire.waiting and not cycles._late_possible
+    assert wire.time < began + ONE_READ_BACK_S, "it did not wait for more"
+
+
+def test_its_attributes_stay_inside_the_object() -> None:
+    """CPython keeps up to 29 there; with more, each access goes through a dictionary, which a cold cache lacks."""
+    assert len(vars(read_back_of(Wire([])))) <= 29
