@@ -38,7 +38,7 @@ class BusConfig:
     """Where the servos are connected and how to communicate with them.
 
     url: device or pyserial URL.
-    one_write: send Sync Write and group read in one write; False if `hil check` finds that an arm needs two.
+    one_write: send Sync Write and group read in one write; False if `hil check` finds that the arm needs two.
     fast_sync_read: use Fast Sync Read if the firmware of every servo supports it.
     slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
     voltage plus temperature.
@@ -90,7 +90,8 @@ class ServoBus(TorqueSwitch):
         """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
         self._exchange: Exchange | None = None
         self.exchanges_per_sample = 1
-        """Number of exchanges per sample, set by `prepare`: they are at most CHECK_S apart if the bus is fast enough.
+        """Number of exchanges per sample, set by `prepare` so that they are at most CHECK_S apart if the bus is fast
+        enough.
         """
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._last_answers: Sequence[Answer] = ()
@@ -222,7 +223,7 @@ class ServoBus(TorqueSwitch):
         self._exchange = exchange
 
     def add_read_back(self, exchange: Exchange) -> None:
-        """Make `exchange` read back the servos' goals, Torque Enable and settings; expect the present settings."""
+        """Make `exchange` read back the servos' goals, Torque Enable and settings, and expect the present settings."""
         modes = [drive.mode for drive in self._drives]
         settings = [[servo.read(name) for name in SETTINGS] for servo in self._servos.values()]
         exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in self._servos.values()]), settings)
@@ -318,7 +319,7 @@ class ServoBus(TorqueSwitch):
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def first_hides_others(self, patience: float) -> bool:
-        """Whether only the first servo is silent and masks the replies of the others. Raises PortLost.
+        """Return whether only the first servo is silent, masking the replies of the others. Raises PortLost.
 
         In a group read, a silent servo masks the replies of those after it. The last servo is therefore read first,
         then the first servo. patience: how long to wait for their replies [s].
@@ -341,9 +342,9 @@ class ServoBus(TorqueSwitch):
 
     @property
     def watchdog_changed(self) -> tuple[int, int] | None:
-        """Index of a joint whose Bus Watchdog was last read back as changed, and its value [20 ms]; otherwise None.
+        """Index of a joint whose Bus Watchdog had changed when last read back, and its value [20 ms]; otherwise None.
 
-        A tripped watchdog is not included: its cause depends on how long no packets were sent.
+        Tripping does not count as a change: its cause depends on how long no packets were sent.
         """
         expected = self.armed_ticks, WATCHDOG_TRIPPED
         for place, ticks in self.prepared.watchdogs:
@@ -364,7 +365,7 @@ class ServoBus(TorqueSwitch):
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """Index of a joint that has missed many of the latest goals, and a text with the value read back; or None."""
+        """Index of a joint that has missed many of the latest goals, and a text on the value read back; otherwise None."""
         if (lost := self.prepared.lost) is None:
             return None
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"
@@ -376,12 +377,12 @@ class ServoBus(TorqueSwitch):
 
     @property
     def heard_instead(self) -> str:
-        """Advice on bytes received in the last 0.1 s instead of complete and timely replies; "" if there were none."""
+        """Advice on irregular replies and other bytes received in the last 0.1 s; "" if there were none."""
         return self.prepared.heard.advice(self.port.clock.now(), self.port.url)
 
     @property
     def commanded_by_another(self) -> str:
-        """Sentence about a recently read-back value that this program did not write; "" if there is none.
+        """Sentence about a value that was recently read back but not written by this program; "" if there is none.
 
         One such value does not prove that there is another master: a servo that misses writes holds an older goal.
         """

@@ -1,8 +1,8 @@
 """The USB adapter's latency timer: how long the adapter may hold back a reply.
 
 FTDI adapters (including the U2D2) buffer received data until 62 bytes have arrived or a timer has expired. The factory
-setting of 16 ms limits the control cycle to 60 Hz. On Linux the timer is set in a sysfs file of the tty that only root
-may write; the port's "low latency" flag also sets it to 1 ms, and any user of the port may set that flag.
+setting of 16 ms limits the control cycle to 60 Hz. On Linux, a sysfs file of the tty sets the timer, but only root may
+write it. The port's "low latency" flag, which any user of the port may set, also sets the timer to 1 ms.
 """
 
 from pathlib import Path
@@ -34,7 +34,7 @@ def latency_timer(url: str, sysfs: Path = _SYSFS) -> Path | None:
 
 
 def read_latency_ms(file: Path) -> int:
-    """Return the timer's value [ms]; if the adapter has just been unplugged, the factory setting."""
+    """Return the timer's value [ms], or the factory setting if the adapter has just been unplugged."""
     try:
         return int(file.read_text())
     except (OSError, ValueError):

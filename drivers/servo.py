@@ -103,7 +103,7 @@ class Servo:
         """Write a register and read it back. Raises the same errors as `read`, and ServoRefused if another value is
         read back.
 
-        attempts: maximum number of attempts at the write, and then at the read; by default, that of all set-up work.
+        attempts: maximum number of attempts at the write, and then at the read; by default, as for all set-up work.
         """
         self._write_and_read_back(register, value, attempts, despite_error=False)
 
@@ -163,7 +163,7 @@ class Servo:
         self._try(f"writing {value} to {register}", send, attempts)
 
     def let_answer(self) -> None:
-        """Set Status Return Level to 2 if the servo answers pings (as at level 0). Raises the same errors as `ping`."""
+        """Set Status Return Level to 2 if the servo answers pings, as it does at level 0. Raises the errors of `ping`."""
         self.ping(attempts=1)
         with suppress(NoReply):
             self.write_only("Status Return Level", 2, attempts=1)

@@ -1,4 +1,4 @@
-"""Torque that is already on at the start: either refuse to start, or take over and let the arm sink slowly."""
+"""Handling of torque that is already on at the start: either refuse to start, or let the arm sink slowly."""
 
 from collections.abc import Mapping
 

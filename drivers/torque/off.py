@@ -31,7 +31,7 @@ from hil.drivers.servo_model import WATCHDOG_UNIT, Mode
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _INTERRUPTS_BORNE = 5
-"""Number of interrupted attempts (Ctrl-C) after which confirming torque off for a servo counts as failed."""
+"""Number of attempts interrupted by Ctrl-C after which cutting a servo's torque counts as failed."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
 """Maximum delay of a watchdog beyond its timeout [s], since it counts in steps of 20 ms."""
@@ -46,13 +46,12 @@ class TorqueOff:
 
     confirmed: joints whose servos were read back as off.
     unconfirmed: the other joints, each with the reason.
-    unwatched: joints, of either group, whose servos have no Bus Watchdog.
+    unwatched: joints of either group whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
     rebooted: confirmed joints whose servos were reset, and so lost the watchdog armed before torque was switched on.
     disarmed: confirmed joints whose servos lost only this watchdog, which another program switched off.
     tripped: joints whose Bus Watchdog may have tripped, which zeroes their goals; it has been cleared since.
-    driven: joints in neither group, whose servos' torque is on because another program switches it on whenever it is
-    cut.
+    driven: joints in neither group, because another program switches their servos' torque on whenever it is cut.
     """
 
     confirmed: tuple[Joint, ...]
@@ -84,7 +83,7 @@ class TorqueOff:
         )
 
     def with_later(self, joint: Joint, *, rebooted: bool | None) -> "TorqueOff":
-        """Return the report with a joint confirmed whose servo has answered again and reads back as off.
+        """Return the report with a joint now confirmed, since its servo has answered again and reads back as off.
 
         rebooted: result of `was_rebooted`.
         """
