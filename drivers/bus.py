@@ -365,7 +365,7 @@ class ServoBus(TorqueSwitch):
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """Index of a joint that has missed many of the latest goals, and a text on the value read back; otherwise None."""
+        """Index of a joint that has missed many of the latest goals, and a text on the value read back; or None."""
         if (lost := self.prepared.lost) is None:
             return None
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"

@@ -163,7 +163,7 @@ class Servo:
         self._try(f"writing {value} to {register}", send, attempts)
 
     def let_answer(self) -> None:
-        """Set Status Return Level to 2 if the servo answers pings, as it does at level 0. Raises the errors of `ping`."""
+        """Set Status Return Level to 2 if the servo answers pings, as it does at level 0. Raises `ping`'s errors."""
         self.ping(attempts=1)
         with suppress(NoReply):
             self.write_only("Status Return Level", 2, attempts=1)

@@ -33,7 +33,7 @@ class DescriptionError(ValueError):
 
 
 class FakeServo(Described):
-    """The initial state of one servo on the bus: set up for its arm, powered, torque off."""
+    """The initial state of one servo on the bus: set up for its arm and powered, with torque off."""
 
     id: Annotated[int, Field(ge=0, le=MAX_ID, description="bus ID")]
     model: Annotated[str, Field(description='name as printed on the servo, e.g. "XM430-W350"')]

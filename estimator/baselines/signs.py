@@ -147,7 +147,7 @@ def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = 
 
 
 def suspect_absolute_unzeroed(recordings: Sequence[Recording]) -> Absolute | None:
-    """Return the same evidence for recordings with unknown zeros: after the change, gravity determines them."""
+    """Like `suspect_absolute`, but for recordings with unknown zeros, which gravity determines after the change."""
     if recordings[0].joints != 2:
         return None
     apart = [_difference(each, 0.0) for each in recordings]

@@ -33,7 +33,7 @@ class Clipped:
     """A joint whose torque seems limited to `level` [N m], although the torque column exceeds it in a fraction `beyond`
     of the samples.
 
-    residual, residual_given: relative RMS of the joint's torque residual, with the limit and as given.
+    residual, residual_given: relative RMS of the joint's torque residual, with the limit and with the torque as given.
     """
 
     joint: int
@@ -64,7 +64,7 @@ class Late:
     """A joint whose torque column seems to be `delay` [s] later than those of the others; negative if earlier.
 
     residual, residual_given: relative RMS of the worst joint's torque residual, with the column shifted by `delay` and
-    as given.
+    with the column as given.
     """
 
     joint: int

@@ -164,8 +164,8 @@ def _power(difference: Array) -> Array:
 def _not_drifted(difference: Array, differs: Array) -> Array:
     """Return the fraction (joints, orders) of each order of the rounding error that repeats despite drift.
 
-    difference: difference of two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,); a fraction of
-    it is noise in the estimated drift, and the effect of this noise is divided out.
+    difference: difference of two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,). A fraction of
+    `differs` is noise in the estimated drift; its effect is divided out.
     """
     filled = _filled(difference)
     closed = without_jump(filled)

@@ -73,7 +73,7 @@ class SettledPeriod:
     """Standard deviation of one sample's error (joints,) [rad]: coloured noise, combined with the larger of measured
     white noise and rounding noise.
 
-    At a low sampling rate, the highest lines contain motion as well as noise, so what repeats in them from period to
+    At a low sampling rate, the highest lines contain motion as well as noise, so the part that repeats from period to
     period is left out.
     """
 

@@ -94,11 +94,11 @@ def design_path(
     speed: Array,
     seed: int,
 ) -> Path:
-    """Design a path with harmonics up to `highest` [Hz], in which each joint stays within limits.
+    """Design a path with harmonics up to `highest` [Hz] that keeps each joint within limits.
 
     The joints stay within `swing` (joints,) [rad] of `centre` (joints,) [rad] and below `speed` (joints,) [rad/s].
     rate: samples per second; period [s]; prior: rough parameters, whose uncertainty determines which information
-    counts. Raises ExcitationError.
+    matters. Raises ExcitationError.
     """
     count = int(np.floor(highest * period + 1e-9))
     if count < 2 or highest > rate / 8 or min(swing.min(), speed.min()) <= 0.0:

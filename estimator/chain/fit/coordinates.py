@@ -56,7 +56,7 @@ LONGEST = 2.0  # maximum change of any coordinate in one step
 
 @dataclass(frozen=True)
 class ChainCoordinates:
-    """The map between parameters and coordinates of order 1."""
+    """The map between the parameters and coordinates whose magnitudes are about 1."""
 
     names: tuple[str, ...]
     scales: Array

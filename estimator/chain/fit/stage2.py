@@ -56,7 +56,7 @@ class ChainFit:
     missing: Array
     """Estimated distance from `value` to the minimum (parameters,) [SI]."""
     white_covariance: Array
-    """Covariance that `value` would have if the errors of all samples were independent."""
+    """Covariance of `value` if the errors of all samples were independent."""
     starts: tuple[Array, ...]
     """State at the first sample of each period (2, joints) [rad, rad/s]."""
     positions: tuple[Array, ...]

@@ -1,8 +1,8 @@
 """Tilt of the base: gravity in the base's frame as a function of two small angles.
 
 The tilt is a rotation of the base about a horizontal axis, given by the components of its rotation vector along two
-axes that are fixed to the base and perpendicular to the nominal gravity; for an upright base they are its x and y. Two
-angles are all that gravity can reveal.
+axes that are fixed to the base and perpendicular to the nominal gravity; for an upright base, these are its x and y
+axes. Gravity cannot reveal more than two angles.
 """
 
 import numpy as np

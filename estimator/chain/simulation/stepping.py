@@ -1,7 +1,7 @@
 """Compiled simulation of a chain under given motor torques, with derivatives.
 
 Friction and drive are modelled as in `hil.estimator.simulation.arm`. Each step uses that module's Rosenbrock method
-ROS2, with the second stage written so that both stages need the regressor at one acceleration only. With f the torques
+ROS2, with the second stage written so that each stage needs the regressor at one acceleration only. With f the torques
 minus friction, S the slopes of friction, ID inverse dynamics, M the mass matrix, and primes for quantities at the end
 of the step as predicted by the first stage,
 
