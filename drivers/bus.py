@@ -1,4 +1,4 @@
-"""Preparation and control cycle of the servos of one arm on one port; `hil.drivers.torque` switches their torque."""
+"""Prepares one arm's servos on one port and runs their control cycle; `hil.drivers.torque` switches their torque."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -87,7 +87,7 @@ class ServoBus(TorqueSwitch):
         self._of = tuple(index for index, joint in enumerate(self.joints) for _ in joint.drives)
         self._in_pairs = len(self._drives) > len(self.joints)
         self._measured = self._drives
-        """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
+        """The entries of `_drives`; `prepare` shifts their zeros to the present turn."""
         self._exchange: Exchange | None = None
         self.exchanges_per_sample = 1
         """Number of exchanges per sample, set by `prepare` so that they are at most CHECK_S apart if the bus is fast
@@ -359,7 +359,7 @@ class ServoBus(TorqueSwitch):
         return None if place is None else self._of[place]
 
     def read_torque(self) -> int | None:
-        """Read Torque Enable of all servos now, before torque is cut; return the same as `torque_lost`."""
+        """Read Torque Enable of all servos now, before torque is cut; then return `torque_lost`."""
         self.prepared.read_torque()
         return self.torque_lost
 
@@ -397,7 +397,7 @@ class ServoBus(TorqueSwitch):
         )
 
     def bear_others(self) -> None:
-        """Stop raising BusOverheard for packets from another master; its writes are still detected."""
+        """Stop raising BusOverheard for packets from another master; writes by that master are still detected."""
         self.prepared.heard.strangers = -math.inf
 
     def read_status_next(self) -> None:

@@ -266,7 +266,7 @@ class Exchange:
         return None if self._read_back is None else self._read_back.torque_off
 
     def read_torque(self) -> int | None:
-        """Read Torque Enable of all servos now, outside a cycle; return the same as `torque_off`. Raises PortLost."""
+        """Read Torque Enable of all servos now, outside a cycle; then return `torque_off`. Raises PortLost."""
         back = self._read_back
         if back is not None and not self._late_possible:
             back.kind, now = TORQUE, self._now()

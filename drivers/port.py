@@ -88,7 +88,7 @@ def open_port(url: str, baud: int) -> "Port":
 
 
 def _claim(url: str, opened: serial.Serial) -> None:
-    """Keep other programs from opening the device, and raise PortNotOpened if one already has."""
+    """Keep other programs from opening the device; raise PortNotOpened if one already has it open."""
     if is_pseudo_terminal(url):
         return
     keep_others_out(opened.fileno())

@@ -1,11 +1,11 @@
 """Cutting torque: torque off is sent to every servo and read back, regardless of failures and interrupts.
 
 The order matters. Every packet feeds the Bus Watchdog of every servo that receives it, whatever ID it addresses. If a
-servo receives packets but does not obey, because it refuses them or its ID has changed, only its watchdog stops its
-current. So torque off is first sent to all servos at once, which takes 0.3 ms; then each servo is polled until one does
-not reply. From then on, the bus stays silent until the Bus Watchdogs time out. If a servo is already silent before
-torque is cut, torque off is sent three times, since a packet may be lost, and the silence begins at once. After the
-silence, all servos not yet confirmed are polled again, several times.
+servo receives packets but does not obey, because it refuses them or its ID has changed, only its watchdog can stop its
+current. Torque off is therefore first sent to all servos at once, which takes 0.3 ms; then each servo is polled until
+one does not reply. From then on, the bus stays silent until the Bus Watchdogs time out. If a servo is already silent
+before torque is cut, torque off is sent three times, since a packet may be lost, and the silence begins at once. After
+the silence, all servos not yet confirmed are polled again, several times.
 
 Ctrl-C raises KeyboardInterrupt at any point of the program, even between two servos while torque is being cut. A
 program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
@@ -240,7 +240,7 @@ def _tell(port: Port, servos: Mapping[Joint, Servo], register: str, value: int, 
 def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> frozenset[Joint]:
     """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more.
 
-    Return the joints whose watchdog has tripped, or may have: this cannot be read afterwards.
+    Return the joints whose watchdog has or may have tripped, which cannot be read afterwards.
     """
     tripped = set(servos)
 
@@ -288,7 +288,8 @@ def has_torque(servo: Servo) -> bool | None:
 
 
 def was_rebooted(servo: Servo) -> bool | None:
-    """Whether a servo whose watchdog is no longer armed was rebooted; None if it is armed, or if nothing is known.
+    """Whether a servo whose watchdog is no longer armed was rebooted; None if the watchdog is armed or nothing is
+    known.
 
     A reboot also resets the goal to its limit; a program that only writes to the watchdog leaves the goal as it is. A
     late reply to an earlier request could be mistaken for the answer, so another register is read before and after.

@@ -39,7 +39,7 @@ class Peer:
 
     name: str
     parameters: dict[str, float]
-    """Base parameters, and any others needed to simulate the result, by name [SI]."""
+    """Base parameters, and any other parameters needed to simulate the result, by name [SI]."""
     std: dict[str, float]
     """Standard errors as reported by the method, by name [SI]."""
     seconds: float

@@ -3,7 +3,7 @@
 Angles that are measured from a fixed direction instead of from the previous link are detected in the same way.
 
 If the torque of the only joint, or of all joints, is reversed, the residual stays the same but inertias and friction
-become negative. Reversing one of two joints contradicts the other joint's equations and so increases the residual.
+become negative. Reversing only one of two joints contradicts the other's equations and so increases the residual.
 """
 
 from collections.abc import Iterator, Sequence

@@ -271,7 +271,7 @@ class _Posed:
 
 
 def _with_every_friction(found: ShootingEstimate) -> ShootingEstimate:
-    """Return the estimate with all dry-friction terms added, so that no defect imitates one; an added load term is 0."""
+    """Return the estimate with all dry-friction terms, so that no defect imitates one; an added load term is 0."""
     model = replace(found.model, friction=FRICTIONS[-1])
     values = {name: term_of(name).initial for name in model.names} | {
         f"load_{joint}": 0.0 for joint in range(1, model.joints + 1)

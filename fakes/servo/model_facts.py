@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 Blocks = tuple[tuple[int, int, int], ...]
-"""Blocks of indirect addressing: addresses of the first address and first data registers, and number of each."""
+"""Blocks of indirect addressing: addresses of the first Indirect Address and first Indirect Data, and number of each.
+"""
 
 
 @dataclass(frozen=True, slots=True)
