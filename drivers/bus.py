@@ -90,9 +90,7 @@ class ServoBus(TorqueSwitch):
         """The entries of `_drives`; `prepare` shifts their zeros to the present turn."""
         self._exchange: Exchange | None = None
         self.exchanges_per_sample = 1
-        """Number of exchanges per sample, set by `prepare` so that they are at most CHECK_S apart if the bus is fast
-        enough.
-        """
+        """Number of exchanges per sample, chosen by `prepare` so that they are at most CHECK_S apart if possible."""
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._last_answers: Sequence[Answer] = ()
 
@@ -397,7 +395,7 @@ class ServoBus(TorqueSwitch):
         )
 
     def bear_others(self) -> None:
-        """Stop raising BusOverheard for packets from another master; writes by that master are still detected."""
+        """Stop raising BusOverheard for packets from another master; its writes to servos are still detected."""
         self.prepared.heard.strangers = -math.inf
 
     def read_status_next(self) -> None:

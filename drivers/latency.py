@@ -1,8 +1,8 @@
 """The USB adapter's latency timer: how long the adapter may hold back a reply.
 
 FTDI adapters (including the U2D2) buffer received data until 62 bytes have arrived or a timer has expired. The factory
-setting of 16 ms limits the control cycle to 60 Hz. On Linux, a sysfs file of the tty sets the timer, but only root may
-write it. The port's "low latency" flag, which any user of the port may set, also sets the timer to 1 ms.
+setting of 16 ms limits the control cycle to 60 Hz. On Linux, root may set the timer in a sysfs file of the tty; the
+port's "low latency" flag, which any user of the port may set, sets the timer to 1 ms.
 """
 
 from pathlib import Path
@@ -11,9 +11,7 @@ FACTORY_MS = 16
 WANTED_MS = 1
 
 LOCAL_S = 1e-3
-"""Latency allowed for a device without a latency timer [s]: a CDC-ACM adapter (one USB frame), a UART, a pty, the fake
-bus.
-"""
+"""Latency allowed for a device without latency timer [s]: a CDC-ACM adapter (one USB frame), UART, pty or fake bus."""
 
 REMOTE_S = 16e-3
 """Latency allowed for a port on a network [s]."""

@@ -139,9 +139,7 @@ class Port:
         self.echoes = False
         """Whether the adapter echoes what it sends; detected during set-up."""
         self.overheard = b""
-        """Bytes that `ask` found pending before a request and kept apart from the reply: late replies, or replies to
-        another master.
-        """
+        """Bytes that `ask` found pending before a request and set aside: late replies, or replies to another master."""
         self.strangers = 0
         """Number of another master's instructions received during set-up work."""
         self._serial = opened

@@ -176,9 +176,7 @@ class ServoModel:
 
     @property
     def torque_per_ampere(self) -> Published:
-        """Torque constant at the output shaft [N m/A]: stall torque divided by stall current, and other published
-        values.
-        """
+        """Torque constant at the output shaft [N m/A]: stall torque over stall current, and other published values."""
         return _spread([stall.torque / stall.current for stall in self.stalls] + list(self.other_constants))
 
     @property

@@ -5,8 +5,8 @@ from collections import deque
 __all__ = ["ForeignValues"]
 
 ENOUGH, WITHIN_S = 3, 10.0
-"""Number of values not written by this program, and the time [s] within which they must be read, to prove that
-something else writes to the servo or alters what is written.
+"""Number of values not written by this program that, if read within this time [s], prove that something else writes to
+the servo or alters what is written.
 """
 
 

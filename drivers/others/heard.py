@@ -74,7 +74,7 @@ class Heard:
         self.late_at, self.mixed_up = now, 0
 
     def instead(self, read: GroupRead, received: bytes, answers: Sequence[Answer], now: float, *, echoes: bool) -> None:
-        """Examine bytes received instead of the regular reply to `read`; `answers` are those found in these bytes."""
+        """Examine bytes received instead of the regular reply to `read`; `answers` are those found in them."""
         self.beside(received, echoes=echoes)
         if any(front in self._expected - read.expected for front in _fronts_of_replies(received)):
             self._was_late(now)  # the beginning of a reply to an earlier request

@@ -125,9 +125,7 @@ class ReadBack:
         self.reads: tuple[GroupRead, ...] = tuple(kind(ids, span) for span in spans)
         self._alone = [list(map(_of_one, ids, one_each(span, len(ids)))) for span in spans]
         self.longest = 0.0
-        """Duration of the longest recent read-back, without its wire time [s]; it decays from one read-back to the
-        next.
-        """
+        """Duration of the longest recent read-back, without wire time [s]; it decays from one read-back to the next."""
         self._longest_again = _AGAIN_SHARE * interval if interval <= _SHORT_CYCLE_S else 0.0
         self._repeated_at = -math.inf
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]

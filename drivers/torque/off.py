@@ -117,9 +117,7 @@ class TorqueOff:
                 )
 
     def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:
-        """Yield each reason why servos are unconfirmed, with their joints; reasons that differ only in the joint's name
-        are merged.
-        """
+        """Yield the reasons why servos are unconfirmed, each with its joints; see `by_reason`."""
         yield from by_reason(self.unconfirmed).items()
 
     def _outcome(self) -> str:
@@ -259,7 +257,7 @@ def cut_again(servo: Servo, *, armed: bool) -> bool | None:
     """Cut the torque of a servo that did not answer before; return whether it was rebooted, as `was_rebooted` does.
 
     armed: whether its Bus Watchdog was armed before torque was switched on; if so, the watchdog is switched off. Raises
-    the same errors as `Servo.write`.
+    the errors of `Servo.write`.
     """
     if servo.read_despite_error("Torque Enable"):
         servo.write_despite_error("Torque Enable", 0)
@@ -279,8 +277,8 @@ def is_torque_on(servo: Servo) -> bool | None:
 def has_torque(servo: Servo) -> bool | None:
     """Read whether a servo's torque is on; None if its answers may belong to other requests.
 
-    A reply does not identify its register, so Torque Enable is read twice, with another register in between.
-    Raises the same errors as `Servo.read`.
+    A reply does not identify its register, so Torque Enable is read twice, with another register in between. Raises the
+    errors of `Servo.read`.
     """
     first = servo.read_despite_error("Torque Enable")
     is_its_own = servo.read_despite_error("ID") == servo.id

@@ -96,7 +96,7 @@ class _Solved:
         return float(self.relative.max())
 
     def distance(self, prior: Prior) -> float:
-        """Squared distance of the base parameters from those of the description, in the prior's standard deviations."""
+        """Squared distance of the base parameters from the description's, in the prior's standard deviations."""
         return float(np.sum(np.square((self.value[: prior.value.size] - prior.value) / prior.std)))
 
     @property
@@ -216,8 +216,7 @@ class ColumnCheck:
         return Late(residuals, chosen, late) if is_late and residuals[0] < LATE * residuals[1] else None
 
     def contradictory_torques(self) -> tuple[float, ...] | None:
-        """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better than factors
-        of 1.
+        """Return torque factors relative to joint 1's (joints,) that explain the recordings better than equal factors.
 
         The links' prior is weak and friction absorbs much of an error, so even a small improvement is evidence.
         """

@@ -74,8 +74,7 @@ class ChainEstimate(FittedParameters):
     zero error (true minus measured angle) [rad]. Empty if not tested.
     """
     noise_steps: Array
-    """Noise of one sample of each angle, encoder rounding included (joints,) [encoder steps]; rounding alone is 0.2887.
-    """
+    """Noise of one sample of each angle, including rounding (joints,) [encoder steps]; rounding alone is 0.2887."""
     at_bound: tuple[str, ...] = ()
     """Parameters at a bound although the data favour values beyond it; empty unless this affects base parameters."""
     conflicts: tuple[Conflict, ...] = ()

@@ -53,9 +53,7 @@ class SettledPeriod:
     [rad], if known (`hil.estimator.data.repeated_noise`).
     """
     coloured_noise: Array | None = None
-    """Standard deviation of the non-white part of one sample's error (joints,) [rad], estimated as for
-    `repeated_noise`, if known.
-    """
+    """Standard deviation of the non-white part of a sample's error (joints,) [rad], if known; see `repeated_noise`."""
     stabiliser: Stabilised | None = None
     """The software stabiliser, if one produced part of `torque`.
 

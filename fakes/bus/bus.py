@@ -197,9 +197,7 @@ class FakeBus:
 
     @property
     def next_reply_by(self) -> float:
-        """Time on `clock` at which the next contiguous group of replies will have arrived [s]; infinite if there is
-        none.
-        """
+        """Time on `clock` when the next contiguous group of replies will have arrived [s]; infinite if none is due."""
         return self._wire.next_reply_by
 
     def discard_input(self) -> None:

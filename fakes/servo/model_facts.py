@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 Blocks = tuple[tuple[int, int, int], ...]
-"""Blocks of indirect addressing: addresses of the first Indirect Address and first Indirect Data, and number of each.
+"""Blocks of indirect addressing: addresses of the first Indirect Address and Indirect Data registers, number of each.
 """
 
 

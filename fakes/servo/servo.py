@@ -83,8 +83,7 @@ class EmulatedServo(Powered):
         self.has_fast_reads = firmware >= model.fast_read_firmware
         """Whether the servo supports Fast Sync Read, Fast Bulk Read and Control Table Backup."""
         self.connected = True
-        """False if its bus cable is disconnected: the servo neither receives nor replies, but the motor keeps its last
-        command.
+        """False if the bus cable is disconnected: the servo neither receives nor replies; the motor keeps its command.
         """
         self.heard_at = 0.0
         """Time at which it received the last instruction packet [s], from which the Bus Watchdog counts."""
@@ -349,9 +348,7 @@ class EmulatedServo(Powered):
         return self.write(body[0] | body[1] << 8, body[2:])
 
     def _clear_turns(self, body: bytes, moving: bool) -> int:
-        """Execute the instruction Clear: shift Present Position, Goal Position and trajectory by the same number of
-        turns.
-        """
+        """Execute Clear: shift Present Position, Goal Position and trajectory by the same number of turns."""
         before = self.present.ticks(self._angle())
         if error := self.present.clear(body, moving, self._angle()):
             return error

@@ -134,9 +134,7 @@ class Goal:
     """Number of samples of the recording."""
 
     def error(self, lines: NDArray[np.complex128]) -> float:
-        """Return the expected RMS error of the rigid-body torque in other motions, relative to that torque's RMS, for
-        the worst joint.
-        """
+        """Return the expected relative RMS error of the rigid-body torque in other motions, for the worst joint."""
         rows = self._seen(self._columns(self.box.path(lines, self._samples))) * self._lengths
         information = rows.T @ rows
         information[np.diag_indices_from(information)] += 1.0

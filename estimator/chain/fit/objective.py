@@ -76,9 +76,7 @@ class ChainProblem:
     prior still decides what the data do not determine.
     """
     added: tuple[Array | None, ...] = ()
-    """Known base parameters of the mass added to the arm in each period (base parameters,) [SI]; None if none was
-    added.
-    """
+    """Known base parameters of the mass added in each period (base parameters,) [SI]; None if there was none."""
     latest: _Latest = field(repr=False, compare=False, default_factory=_Latest)
 
     @property

@@ -15,9 +15,7 @@ class ChainOptions:
     A softer observer extracts more information; one that is too soft no longer follows the motion.
     """
     lost: float = 1.5
-    """A softer observer is rejected if the cost grows by more than this factor times the growth expected from its
-    softness.
-    """
+    """A softer observer is rejected if the cost grows by more than this factor times the growth due to its softness."""
     first_step: float = 5.2e-3
     """Integration step while the observer is stiff [s]; samples within such a step are skipped."""
     coarse_step: float = 2.6e-3
@@ -51,8 +49,7 @@ class ChainOptions:
     ftol_nearer: float = 1e-3
     ftol: float = 2e-5
     towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
-    """Initial guesses, as fractions of the distance from the prior to stage 1's result; the first that can be simulated
-    is used.
+    """Initial guesses, as fractions of the way from prior to stage 1's result; the first that can be simulated is used.
     """
     unfinished: float = 1.0
     """If one more step is expected to decrease the sum of squares by more than this, the minimum has not been reached,

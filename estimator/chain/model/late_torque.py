@@ -2,8 +2,8 @@
 
 The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
 product of back-EMF and lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due
-to back-EMF. The lag of a winding can cancel at most half of a joint's inertia, at which point the poles of the
-equivalent motor coincide. Parameters far from a fit's minimum may imply a greater loss, which is limited to this value.
+to back-EMF. The lag of a winding cancels at most half of a joint's inertia; then, the poles of the equivalent motor
+coincide. Far from a fit's minimum, a greater loss is limited to this value.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,9 +18,7 @@ from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 MEANINGS = {"lag_ratio": "ratio of the lag of the joint's current loop to joint 1's"}
 """Meanings of the kinds of parameters specific to chains."""
 PART = 0.1
-"""`limited` names a joint's back-EMF only if the joint's contribution to the motion that loses the most inertia exceeds
-this fraction.
-"""
+"""`limited` names a joint's back-EMF only if its part in the motion that loses the most inertia exceeds this."""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
 _ARMATURE = 10  # of a link's parameters
