@@ -11,7 +11,7 @@ FACTORY_MS = 16
 WANTED_MS = 1
 
 LOCAL_S = 1e-3
-"""Latency allowed for a device without latency timer [s]: a CDC-ACM adapter (one USB frame), UART, pty or fake bus."""
+"""Latency allowed for a device without a latency timer [s]: CDC-ACM adapter (one USB frame), UART, pty or fake bus."""
 
 REMOTE_S = 16e-3
 """Latency allowed for a port on a network [s]."""

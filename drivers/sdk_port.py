@@ -121,10 +121,10 @@ class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 
 
 def _first_status(received: bytes) -> tuple[bytes, int]:
-    """Return the first intact status packet among the received bytes, and 0.
+    """Return the first intact status packet among the received bytes, and 0 as the number of bytes to read next.
 
-    If there is none, return b"" and the number of bytes to read next: at most the rest of the packet that has begun, so
-    that the next packet stays whole.
+    If there is none, return b"" and at most the length of the rest of the packet that has begun, so that the next
+    packet stays whole.
     """
     missing = _SHORTEST - next(size for size in range(len(HEADER) - 1, -1, -1) if received.endswith(HEADER[:size]))
     at = received.find(HEADER)

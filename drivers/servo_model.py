@@ -91,7 +91,7 @@ class Published(NamedTuple):
     """A published torque constant: the median, lowest and highest of the figures.
 
     It is uncertain even where the figures agree: an individual servo's stall torque can differ by tens of percent. If
-    it matters, measure the constant with a known weight.
+    that matters, measure the constant with a known weight.
     """
 
     value: float
@@ -149,7 +149,8 @@ class ServoModel:
         return self.no_load.voltage / self.no_load.speed
 
     def is_out_of_voltage(self, goal: float, carried: float, velocity: float, supply: float = math.nan) -> bool:
-        """Whether a current falls short of its goal because the voltage cannot drive more through the turning motor.
+        """Whether a current falls short of its goal because the voltage is too low to drive it through the turning
+        motor.
 
         This is taken as the cause if the motor turns in the direction of its goal and the voltage across its terminals
         (voltage drop of the winding plus back-EMF) is about the supply voltage.

@@ -67,7 +67,7 @@ def code_digest(function: Callable[..., Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return the Python function behind a compiled one; anything else unchanged."""
+    """Return the Python function behind a compiled one, or anything else unchanged."""
     return getattr(value, "py_func", value)
 
 

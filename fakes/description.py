@@ -192,7 +192,7 @@ def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def found_beside(folder: Path, name: str) -> Path:
-    """Return the file that a TOML file in `folder` calls `name` or, if it does not exist, its namesake in `folder`."""
+    """Return the file `name` of a TOML file in `folder` or, if it does not exist, its namesake in `folder` itself."""
     named = folder / name
     return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name
 

@@ -43,7 +43,7 @@ class Heard:
         reply that was certainly a repetition [s on the port's clock].
         """
         self.latest = b""
-        """What was received in reply to the latest request."""
+        """Bytes received in reply to the latest request."""
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0

@@ -27,10 +27,10 @@ _GOALS_PER_OTHER_IN_DOUBT = 4
 """Minimum number of goal read-backs between two read-backs of other kinds while a foreign value is suspected."""
 
 _RECENT = 4
-"""After lost writes, a servo may still hold any of this many latest goals; the status detects longer losses."""
+"""After lost writes, a servo may still hold any of the latest `_RECENT` goals; the status detects longer losses."""
 
 REMEMBERED = 128
-"""Until the status shows that writes are lost, a servo may still hold any of this many latest goals."""
+"""Until the status shows that writes are lost, a servo may still hold any of the latest `REMEMBERED` goals."""
 
 _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Numbers of read-backs of a foreign value that prove another writer, and the time within which they must occur [s].
@@ -154,7 +154,7 @@ class ReadBack:
         self._missed: list[deque[int]] = [deque(maxlen=LOST_GOALS) for _ in ids]
         """Indices of the latest read-backs that found an older goal of this program, by servo."""
         self.watchdogs: list[tuple[int, int]] = []
-        """Index and Bus Watchdog of each servo that answered the latest read-back, if that was of goals."""
+        """Index and Bus Watchdog of each servo that answered the latest read-back, if it read goals."""
         self.torque_off: int | None = None
         """Index of a servo whose Torque Enable read 0 when it was last read back; None if there is none."""
         self.overdue_at = math.inf

@@ -25,7 +25,7 @@ the supply current, which is slow to reveal a loss of torque.
 def cadence(
     sample: float, port: Port, drives: Sequence[Joint], tables: Sequence[ControlTable], return_delay: float
 ) -> tuple[int, Spans | None, int]:
-    """Return the exchanges per sample, the status registers, and the number of exchanges between two status reads.
+    """Return the number of exchanges per sample, the status registers, and the number of exchanges per status read.
 
     The registers are None if there is no time to read the status. sample: time between two samples [s], 0 if unknown.
     drives: one entry per servo. return_delay: the servos' longest Return Delay Time [s].

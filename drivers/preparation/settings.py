@@ -78,8 +78,8 @@ WATCHDOG_TRIPPED = 0xFF
 def read_settings(servo: Servo) -> dict[str, int]:
     """Return the registers that an experiment may change, by name [ticks]. Raises the errors of `Servo.read`.
 
-    All are read twice, the second time in reverse order. Otherwise, since replies do not identify their register, one
-    to an earlier request could be stored, and later restored, as the value of another register.
+    All are read twice, the second time in reverse order, because a reply does not identify its register: a reply to an
+    earlier request could be stored, and later restored, as the value of another register.
     """
     names = [name for name in (*EEPROM, *RAM) if name in servo.table]
     settings = {name: servo.read(name) for name in names}

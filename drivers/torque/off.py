@@ -71,7 +71,7 @@ class TorqueOff:
     def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
         """Return the report after another program has switched torque on again.
 
-        on: joints whose servos have torque on again each time it is cut. silent: joints whose servos have not
+        on: joints whose servos' torque is on again each time it is cut. silent: joints whose servos have not
         answered since.
         """
         why = "Another program had switched its torque on again, and it has not answered since."
@@ -300,7 +300,7 @@ def was_rebooted(servo: Servo) -> bool | None:
 
 
 def _confirm(servo: Servo, interrupts: list[BaseException], *, at_once: bool) -> Exception | None:
-    """Write torque off and read it back; return None, or the failure.
+    """Switch torque off and read it back; return None, or the failure.
 
     at_once: try only once, and send nothing after a missing reply.
     """

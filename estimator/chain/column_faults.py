@@ -44,7 +44,7 @@ TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 
 
 @dataclass(frozen=True)
 class Reversed:
-    """Reversed columns. residuals: relative RMS of the worst joint's torque residual with the change, and as given.
+    """Reversed columns. residuals: relative RMS of the worst joint's torque residual with the change and without it.
     impossible: whether friction is negative with the columns as given, as when all torques, or the columns of a
     vertical first joint, are reversed.
     """
@@ -267,8 +267,8 @@ class ColumnCheck:
 class _Normal:
     """Normal equations of each joint's torques.
 
-    squares: (joints, names, names). products: those with the torque (joints, names). torque: mean square of the torque
-    (joints,).
+    squares: products of the columns (joints, names, names). products: products of columns and torque (joints, names).
+    torque: mean square of the torque (joints,).
     """
 
     squares: Array

@@ -253,7 +253,7 @@ class _Posed:
         return factor
 
     def _scaled_rows(self, number: int, rows: Array, shared: Array) -> tuple[Array, Array]:
-        """Return the residual with scaled angles and the simulated angles, in units of the noise (joints, samples)."""
+        """Return the residual for scaled angles, and the simulated angles, in units of the noise (joints, samples)."""
         measured = self._altered.measured(number)
         known = np.isfinite(self._altered.problem.segments[number].position)
         angle = np.where(known, rows + measured, 0.0)

@@ -41,7 +41,7 @@ class Defect:
 
     @property
     def explained(self) -> float:
-        """Explained fraction of the residual power beyond the noise."""
+        """Fraction of the residual power beyond the noise that the defect explains."""
         return (self.given.left - self.fit.left) / max(self.given.left - 1.0, 1e-6)
 
 

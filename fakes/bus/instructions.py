@@ -37,7 +37,7 @@ class Line(Protocol):
     def send(self, replies: Sequence[Reply], now: float) -> None:
         """Put replies on the wire.
 
-        Each starts after its delay from the end of the previous one; the first delay counts from `now`.
+        Each starts with its delay after the end of the previous one; the first delay counts from `now`.
         """
         ...
 

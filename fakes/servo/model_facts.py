@@ -1,8 +1,8 @@
 """Properties missing from the SDK's control tables: registers' access, factory values and ranges; motor constants.
 
 Source: ROBOTIS e-Manual, pages x/<model> and, for the motors, _data/dxl_x_info.yml and _includes/common/compatible_dxl/
-of its repository ROBOTIS-GIT/emanual (revisions of 2018 to 2024). Differences from some revisions: the range of Min
-Voltage Limit, given there as 110 to 300 with a factory value of 95, is 95 to 160 here, as on the sister models.
+of the e-Manual's repository ROBOTIS-GIT/emanual (revisions of 2018 to 2024). Differences from some revisions: the range
+of Min Voltage Limit, given there as 110 to 300 with a factory value of 95, is 95 to 160 here, as on the sister models.
 Protocol Type only accepts 2, because a fake servo does not support any other. Drive Mode accepts bit 3 (Torque On by
 Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the others. Velocity Limit of
 the XH430-W210 is that of the XD430-T210; its own oldest page states 360.
@@ -17,8 +17,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 Blocks = tuple[tuple[int, int, int], ...]
-"""Blocks of indirect addressing: addresses of the first Indirect Address and Indirect Data registers, number of each.
-"""
+"""Blocks of indirect addressing: addresses of the first Indirect Address and Indirect Data, and number of each."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -257,7 +257,7 @@ class ChainProblem:
         return self.steps, self.softness, self.finer, self.every
 
     def scatter(self, x: Array, lags: int) -> Array:
-        """Return the sum of products of the scores for the coordinates; see `hil.estimator.fit.covariance`."""
+        """Return the matrix S of the scores (coordinates, coordinates); see `hil.estimator.fit.covariance`."""
         total = np.zeros((x.size, x.size))
         parameters = self.parameters(x)
         for index, (period, weight) in enumerate(zip(self.periods, self.weights, strict=True)):

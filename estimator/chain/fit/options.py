@@ -49,8 +49,7 @@ class ChainOptions:
     ftol_nearer: float = 1e-3
     ftol: float = 2e-5
     towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
-    """Initial guesses, as fractions of the way from prior to stage 1's result; the first that can be simulated is used.
-    """
+    """Initial guesses, as fractions of the way from the prior to stage 1's result; the first feasible one is used."""
     unfinished: float = 1.0
     """If one more step is expected to decrease the sum of squares by more than this, the minimum has not been reached,
     and the fit continues with shorter integration steps. A decrease of 1 corresponds to a distance of one standard

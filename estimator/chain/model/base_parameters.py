@@ -24,7 +24,7 @@ ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, i
 SAMPLES = 150
 KINDS = (slice(1, 4), slice(4, 10), slice(10, 11), slice(0, 1))  # moments, inertias, armature, mass
 CLEARLY_INDEPENDENT = 0.1
-"""A column is kept at once if the part that the columns kept so far do not explain has a norm above this value.
+"""A column is kept at once if the part of it that the columns kept so far do not explain has a norm above this.
 
 The norm is relative to the largest column of the same link and kind.
 """
