@@ -1,4 +1,4 @@
-"""Preparation and control cycle of the servos of one arm on one port; `hil.drivers.torque` switches their torque."""
+"""Prepares one arm's servos on one port and runs their control cycle; `hil.drivers.torque` switches their torque."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -38,7 +38,7 @@ class BusConfig:
     """Where the servos are connected and how to communicate with them.
 
     url: device or pyserial URL.
-    one_write: send Sync Write and group read in one write; False if `hil check` finds that an arm needs two.
+    one_write: send Sync Write and group read in one write; False if `hil check` finds that the arm needs two.
     fast_sync_read: use Fast Sync Read if the firmware of every servo supports it.
     slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
     voltage plus temperature.
@@ -87,11 +87,10 @@ class ServoBus(TorqueSwitch):
         self._of = tuple(index for index, joint in enumerate(self.joints) for _ in joint.drives)
         self._in_pairs = len(self._drives) > len(self.joints)
         self._measured = self._drives
-        """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
+        """The entries of `_drives`; `prepare` shifts their zeros to the present turn."""
         self._exchange: ReadBackExchange | None = None
         self.exchanges_per_sample = 1
-        """Number of exchanges per sample, set by `prepare`: they are at most CHECK_S apart if the bus is fast enough.
-        """
+        """Number of exchanges per sample, chosen by `prepare` so that they are at most CHECK_S apart if possible."""
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._last_answers: Sequence[Answer] = ()
 
@@ -222,7 +221,7 @@ class ServoBus(TorqueSwitch):
         self._exchange = exchange
 
     def add_read_back(self, exchange: ReadBackExchange) -> None:
-        """Make `exchange` read back the servos' goals, Torque Enable and settings; expect the present settings."""
+        """Make `exchange` read back the servos' goals, Torque Enable and settings, and expect the present settings."""
         modes = [drive.mode for drive in self._drives]
         settings = [[servo.read(name) for name in SETTINGS] for servo in self._servos.values()]
         exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in self._servos.values()]), settings)
@@ -318,7 +317,7 @@ class ServoBus(TorqueSwitch):
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def first_hides_others(self, patience: float) -> bool:
-        """Whether only the first servo is silent and masks the replies of the others. Raises PortLost.
+        """Return whether only the first servo is silent, masking the replies of the others. Raises PortLost.
 
         In a group read, a silent servo masks the replies of those after it. The last servo is therefore read first,
         then the first servo. patience: how long to wait for their replies [s].
@@ -341,9 +340,9 @@ class ServoBus(TorqueSwitch):
 
     @property
     def watchdog_changed(self) -> tuple[int, int] | None:
-        """Index of a joint whose Bus Watchdog was last read back as changed, and its value [20 ms]; otherwise None.
+        """Index of a joint whose Bus Watchdog had changed when last read back, and its value [20 ms]; otherwise None.
 
-        A tripped watchdog is not included: its cause depends on how long no packets were sent.
+        Tripping does not count as a change: its cause depends on how long no packets were sent.
         """
         expected = self.armed_ticks, WATCHDOG_TRIPPED
         for place, ticks in self.prepared.watchdogs:
@@ -358,13 +357,13 @@ class ServoBus(TorqueSwitch):
         return None if place is None else self._of[place]
 
     def read_torque(self) -> int | None:
-        """Read Torque Enable of all servos now, before torque is cut; return the same as `torque_lost`."""
+        """Read Torque Enable of all servos now, before torque is cut; then return `torque_lost`."""
         self.prepared.read_torque()
         return self.torque_lost
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """Index of a joint that has missed many of the latest goals, and a text with the value read back; or None."""
+        """Index of a joint that has missed many of the latest goals, and a text on the value read back; or None."""
         if (lost := self.prepared.lost) is None:
             return None
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"
@@ -376,12 +375,12 @@ class ServoBus(TorqueSwitch):
 
     @property
     def heard_instead(self) -> str:
-        """Advice on bytes received in the last 0.1 s instead of complete and timely replies; "" if there were none."""
+        """Advice on irregular replies and other bytes received in the last 0.1 s; "" if there were none."""
         return self.prepared.heard.advice(self.port.clock.now(), self.port.url)
 
     @property
     def commanded_by_another(self) -> str:
-        """Sentence about a recently read-back value that this program did not write; "" if there is none.
+        """Sentence about a value that was recently read back but not written by this program; "" if there is none.
 
         One such value does not prove that there is another master: a servo that misses writes holds an older goal.
         """
@@ -396,7 +395,7 @@ class ServoBus(TorqueSwitch):
         )
 
     def bear_others(self) -> None:
-        """Stop raising BusOverheard for packets from another master; its writes are still detected."""
+        """Stop raising BusOverheard for packets from another master; its writes to servos are still detected."""
         self.prepared.heard.strangers = -math.inf
 
     def read_status_next(self) -> None:

@@ -7,8 +7,7 @@ import time
 from typing import Protocol
 
 SPIN_S = 300e-6
-"""How long before a deadline the wall clock stops sleeping and spins instead [s]: a sleep can overrun by 0.2 ms.
-"""
+"""How long before a deadline the wall clock stops sleeping and spins instead [s]; a sleep can overrun by 0.2 ms."""
 
 
 class Clock(Protocol):

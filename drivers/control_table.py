@@ -41,7 +41,7 @@ class Register:
 
     @property
     def signed(self) -> bool:
-        """Whether the value is two's complement. The `.model` files mark only some of the signed registers."""
+        """Whether the value is in two's complement. The `.model` files mark only some of the signed registers."""
         return self.name in _SIGNED
 
     def encode(self, value: int) -> bytes:

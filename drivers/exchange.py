@@ -1,10 +1,11 @@
 """The control cycle on the wire: goals out and states in, with one write and one bounded read.
 
-Current mode and PWM mode have different goal registers. Each is written by its own Sync Write; all are sent in the same
-write to the port.
+Current mode and PWM mode have different goal registers. Each register has its own Sync Write, but all of these are sent
+in one write to the port.
 
 A Sync Write has no reply, so the group read that follows it can be sent in the same write, which takes one adapter
-transaction instead of two. All packets are prepared in advance; a cycle only packs the goals and computes one CRC.
+transaction instead of two. All packets are prepared in advance; a cycle only packs the goals and computes one CRC
+per goal register.
 
 The registers that are read vary from cycle to cycle. Most cycles read `spans[0]`. Every `slow_every`-th cycle reads one
 of the other spans, in turn; every `status_every`-th cycle reads `status`, the registers that show whether torque is
@@ -30,7 +31,7 @@ from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRea
 from hil.drivers.turns import NEVER, Turns
 
 HOST_S = 0.75e-3
-"""Time allowed for the computer itself, including USB frames, in addition to wire, servos and adapter [s]."""
+"""Time allowed for the computer itself, including USB frames [s]; added to the times of wire, servos and adapter."""
 
 PATIENCE_SHARE = 0.5
 """Minimum reply timeout as a fraction of the time between two cycles."""
@@ -44,7 +45,7 @@ many cycles late is recognised by its length.
 """
 
 REMEMBERED = 128
-"""Number of recent goals that a servo may still hold until the status detects that writes are lost."""
+"""Until the status shows that writes are lost, a servo may still hold any of the latest `REMEMBERED` goals."""
 
 _LONGEST_REPLY = 1024
 _DOUBTS = 3
@@ -82,7 +83,7 @@ class Exchange:
     status_every: number of cycles between two status reads; there are none if `status` is None.
     interval: time between two cycles [s], 0 if unknown; the longer it is, the longer a cycle can wait for a reply.
     patience: minimum time to wait for replies [s]; by default the longest time that wire, servos and adapter may need.
-    beside: registers that are read back between cycles; a late reply to such a read is recognised by its length, too.
+    beside: registers that are read back between cycles; a late reply to such a read is also recognised by its length.
     """
 
     def __init__(
@@ -113,7 +114,7 @@ class Exchange:
         self.fast = fast
         self.one_write = one_write
         self._is_plain = one_write and not self._echoes
-        """Whether goals and request are sent in one write, and only the reply is received."""
+        """Whether goals and request are sent in one write and are not echoed."""
         self._writes = [
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
@@ -178,7 +179,7 @@ class Exchange:
         return max(plan.reply_time.timeout for plan in self._plans)
 
     def wait_longer(self, seconds: float) -> None:
-        """Wait this much longer [s] for missing replies from now on: they may merely be late."""
+        """From now on, wait this much longer [s] for missing replies, which may merely be late."""
         is_usual = self._latest_plan is self._usual
         self._plans = [replace(plan, reply_time=self._longer(plan, seconds)) for plan in self._plans]
         self._usual = self._plans[0]
@@ -265,8 +266,8 @@ class Exchange:
         """Handle replies that arrive sooner than the wire time allows: they may belong to an earlier request.
 
         A duplicated reply is still in the input when the next request is sent; if it were used, every later reply
-        would be one cycle old. If the true reply follows, that one is used. If none follows, the port is not a real
-        serial line but, say, a pty, and after a few such cases the check is switched off.
+        would be one cycle old. If the true reply follows, it is used. Otherwise, the port is not a real serial line
+        but, say, a pty, and after a few such cases this check is switched off.
         """
         received = self._port.read(read.reply_size, max(0.0, deadline - self._now()))
         if not received:
@@ -275,7 +276,7 @@ class Exchange:
         return read.unpack(received) or self._search(read, received, deadline)
 
     def _any_span(self, between: bool) -> int:
-        """Choose the span for a cycle: one of another length after a lost reply, otherwise the one that is due."""
+        """Choose the span for a cycle: after a lost reply, one of another length; otherwise, the one that is due."""
         self._turns.count(self._usual_left)
         if self._late_possible:
             self._late_possible = False
@@ -315,7 +316,7 @@ class Exchange:
         self._port.overheard = b""
 
     def _ask_otherwise(self, sent: bytes, plan: "_Plan", start: float) -> bytes:
-        """Return the reply without an echo; used if two writes are needed or the adapter echoes what is sent."""
+        """Return the reply without any echo; used if two writes are needed or the adapter echoes what is sent."""
         port, read = self._port, plan.read
         count = read.reply_size + (len(sent) if self._echoes else 0)
         if self.one_write:
@@ -354,9 +355,9 @@ class _Plan:
     """One of the group reads of an exchange.
 
     span: the span that a Reply reports. reply_time: how long to wait for the replies. pack_behind: packs the goals' CRC
-    and the request. wire_s: wire time of goals, request and replies [s]. soonest: a complete reply
-    that arrives sooner than this after the start of a cycle may belong to an earlier request [s]. is_after_loss:
-    whether a late reply may be on the wire when this read is sent, and may destroy the goals.
+    and the request. wire_s: wire time of goals, request and replies [s]. soonest: time from the start of a cycle before
+    which a complete reply may belong to an earlier request [s]. is_after_loss: whether a late reply may be on the wire
+    when this read is sent, and may destroy the goals.
     """
 
     read: GroupRead
@@ -369,7 +370,7 @@ class _Plan:
 
 
 class _GoalWrite:
-    """A Sync Write of one goal register to a subset of the servos, given as indices `places` into all IDs."""
+    """A Sync Write of one goal register to some of the servos; `places` are their indices among all IDs."""
 
     def __init__(self, goal: Register, ids: Sequence[int], places: Sequence[int]) -> None:
         # A two-byte value between ID bytes (at most 252) can never hold FF FF FD: the goals are never stuffed.
@@ -382,8 +383,8 @@ class _GoalWrite:
         self.size = packet.size + 2
 
     def pack(self, goal_ticks: Sequence[int]) -> bytes:
-        """Return the packet for these goals, one per servo of the subset; raises struct.error if one is too large,
-        ValueError or struct.error if their number is wrong.
+        """Return the packet for these goals, one per servo in `places`; raises struct.error for a goal that is too
+        large, ValueError or struct.error for the wrong number of goals.
         """
         fields = self.fields
         fields[2::2] = goal_ticks

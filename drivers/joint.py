@@ -29,8 +29,8 @@ class Joint:
     mode: kind of goal, a current [A] or a voltage [V]. Raises ValueError if the servo does not support this mode.
     near: approximate joint angle when the bus is opened [rad], which selects the turn; None to use Present Position
     unchanged.
-    seconds: additional servos of the same model on this joint. A goal is divided equally among all servos; the measured
-    current (in PWM mode the voltage) is their sum; angle and velocity are the first servo's.
+    seconds: additional servos of the same model on this joint. A goal is divided equally among all servos; measured
+    currents (in PWM mode, voltages) are summed; angle and velocity are the first servo's.
     """
 
     name: str
@@ -83,8 +83,8 @@ class Joint:
     def within_turn(self, position_ticks: int) -> "Joint":
         """Return this joint with its zero shifted by whole turns, so that its angle is closest to `near`.
 
-        Without `near`, the joint is returned unchanged. At power-up, a servo starts within one turn, so the reading of
-        a joint that rests just beyond the end of that turn is off by a whole turn.
+        Without `near`, the joint is returned unchanged. At power-up, a servo starts within one turn; if the joint rests
+        just beyond the end of that turn, its angle is off by a whole turn.
         """
         if self.near is None:
             return self

@@ -132,7 +132,7 @@ class Framer:
 
     A packet whose CRC does not match is counted in `bad_crc`. The search for a header then resumes at the next
     byte, since the length itself may be corrupted. With `damaged=True` the framer behaves like a servo: it trusts the
-    length and returns the packet marked as damaged, because a servo answers it with an error.
+    length and returns the packet marked as damaged, because a servo answers such a packet with an error.
     A LEN above `longest` is treated as noise.
     """
 

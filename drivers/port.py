@@ -2,7 +2,7 @@
 
 Open one with `open_port`. `Port` does its I/O through pyserial and so supports every URL that pyserial does;
 `NetworkPort` avoids pyserial's waits on a network; `DescriptorPort` reads and writes a local device directly, at half
-of pyserial's cost per cycle.
+pyserial's cost per cycle.
 """
 
 import contextlib
@@ -49,10 +49,10 @@ pending input in advance: on such a line, pending input is detected because it a
 """
 
 _LOOKS_AFTER_LOSS = 2 * _LOOKS
-"""Like `_LOOKS`, but after pending input or a lost reply: a late reply may then arrive at any time."""
+"""Value of `_LOOKS` after pending input or a lost reply, since a late reply may then arrive at any time."""
 
 _ALWAYS = 1 << 62
-"""Like `_LOOKS`, but for a line whose replies usually arrive earlier than its baud rate allows, such as a pty."""
+"""Value of `_LOOKS` for a line whose replies usually arrive earlier than its baud rate allows, such as a pty."""
 
 _EARLY_BITS = 9.0
 """Assumed number of bits per transmitted byte. A reply counts as early if it arrives before the request can have been
@@ -88,7 +88,7 @@ def open_port(url: str, baud: int) -> "Port":
 
 
 def _claim(url: str, opened: serial.Serial) -> None:
-    """Keep other programs from opening the device, and raise PortNotOpened if one already has."""
+    """Keep other programs from opening the device; raise PortNotOpened if one already has it open."""
     if is_pseudo_terminal(url):
         return
     keep_others_out(opened.fileno())
@@ -110,10 +110,10 @@ def _check_baud(url: str, opened: serial.Serial, baud: int) -> None:
 
 
 class ReplyTime(NamedTuple):
-    """When a reply may arrive, counted from the start of its request; created by `Port.reply_time`.
+    """Times at which a reply may arrive, counted from the start of its request; created by `Port.reply_time`.
 
-    timeout: when it counts as lost [s]. whole_ms: `timeout` in whole milliseconds. earliest: earliest time at which the
-    request can have been transmitted [s].
+    timeout: when the reply counts as lost [s]. whole_ms: `timeout` in whole milliseconds. earliest: earliest time at
+    which the request can have been transmitted [s].
     """
 
     timeout: float
@@ -133,15 +133,13 @@ class Port:
         self.baud = baud
         self.latency = adapter_latency(url)
         self.off_wire = 0.0
-        """What the fastest of a few requests took in addition to its time on the wire [s]; 0 if not measured."""
+        """Time that the fastest of a few requests took in addition to its time on the wire [s]; 0 if not measured."""
         self.latency_measured = False
         """Whether `latency` was measured, because replies arrive later than expected from this kind of adapter."""
         self.echoes = False
         """Whether the adapter echoes what it sends; detected during set-up."""
         self.overheard = b""
-        """Bytes that `ask` found pending before a request and kept apart from the reply: late replies, or replies to
-        another master.
-        """
+        """Bytes that `ask` found pending before a request and set aside: late replies, or replies to another master."""
         self.strangers = 0
         """Number of another master's instructions received during set-up work."""
         self._serial = opened

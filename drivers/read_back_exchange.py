@@ -45,8 +45,8 @@ class ReadBackExchange(Exchange):
     ) -> None:
         """Prepare the read-backs made by `overruled` (see `ReadBack`).
 
-        goal: spans of Bus Watchdog and goal. mode: spans that end with the settings, whose values are `modes`. torque:
-        spans that begin with Torque Enable.
+        goal: spans of Bus Watchdog and goal. mode: spans that end with the settings. modes: each servo's settings.
+        torque: spans that begin with Torque Enable.
         """
         back = self._read_back = ReadBack(
             *(self.ids, goal, mode, modes, torque),
@@ -66,7 +66,7 @@ class ReadBackExchange(Exchange):
 
     @property
     def sighted(self) -> Overruled | None:
-        """A recently read-back value that this program did not write; None if there is none."""
+        """A value that was recently read back but not written by this program; None if there is none."""
         return self._read_back.sighted if self._read_back is not None and self.is_in_doubt else None
 
     @property
@@ -85,7 +85,7 @@ class ReadBackExchange(Exchange):
         return None if self._read_back is None else self._read_back.torque_off
 
     def read_torque(self) -> int | None:
-        """Read Torque Enable of all servos now, outside a cycle; return the same as `torque_off`. Raises PortLost."""
+        """Read Torque Enable of all servos now, outside a cycle; then return `torque_off`. Raises PortLost."""
         back = self._read_back
         if back is not None and not self._late_possible:
             back.kind, now = TORQUE, self._now()

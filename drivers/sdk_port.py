@@ -15,14 +15,14 @@ _SHORTEST = 11
 """Number of bytes of a status packet without data."""
 
 _BEFORE_LENGTH, _FRONT = 7, 8
-"""Number of bytes of a packet that LEN does not count, and number of bytes up to and including its instruction."""
+"""Number of bytes of a packet that LEN does not count, and number of bytes up to and including INST."""
 
 
 class SdkPort:
     """Adapts an open `Port` to `dynamixel-sdk`, removing the echo of an adapter that receives its own transmissions.
 
-    Unlike in the SDK's own port, reads block instead of polling, and time is that of the port's clock. A failure cannot
-    leave the port marked as in use, which would keep torque from being cut. The method names are the SDK's.
+    Unlike those of the SDK's own port, reads block instead of polling and use the port's clock. A failure cannot leave
+    the port marked as in use, which would keep torque from being cut. The method names are the SDK's.
     """
 
     def __init__(self, port: Port) -> None:
@@ -121,10 +121,10 @@ class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 
 
 def _first_status(received: bytes) -> tuple[bytes, int]:
-    """Return the first intact status packet among the received bytes, and 0.
+    """Return the first intact status packet among the received bytes, and 0 as the number of bytes to read next.
 
-    If there is none, return b"" and the number of bytes to read next: at most the rest of the packet that has begun, so
-    that the next packet stays whole.
+    If there is none, return b"" and at most the length of the rest of the packet that has begun, so that the next
+    packet stays whole.
     """
     missing = _SHORTEST - next(size for size in range(len(HEADER) - 1, -1, -1) if received.endswith(HEADER[:size]))
     at = received.find(HEADER)

@@ -66,7 +66,7 @@ class Servo:
         return self.read_entry(self.table[register], attempts, despite_error=True)
 
     def read_entry(self, entry: Register, attempts: int = _ATTEMPTS, *, despite_error: bool = False) -> int:
-        """Read a register that need not be in the model's table. Raises the same errors as `read`.
+        """Read a register that need not be in the model's table. Raises the errors of `read`.
 
         despite_error: also accept a reply that contains the value and reports an error.
         """
@@ -100,10 +100,10 @@ class Servo:
         return entry.decode(bytes(self._try(f"reading {entry.name}", ask, attempts, is_read=True)))
 
     def write(self, register: str, value: int, attempts: int | None = None) -> None:
-        """Write a register and read it back. Raises the same errors as `read`, and ServoRefused if another value is
-        read back.
+        """Write a register and read it back. Raises the errors of `read`, and ServoRefused if another value is read
+        back.
 
-        attempts: maximum number of attempts at the write, and then at the read; by default, that of all set-up work.
+        attempts: maximum number of attempts at the write, and then at the read; by default, as for all set-up work.
         """
         self._write_and_read_back(register, value, attempts, despite_error=False)
 
@@ -150,9 +150,7 @@ class Servo:
             raise refused or _not_held(self.title, register, value, actual)
 
     def write_only(self, register: str, value: int, attempts: int = _ATTEMPTS) -> None:
-        """Write a register without reading it back, as needed for ID and Baud Rate. Raises the same errors as
-        `read`.
-        """
+        """Write a register without reading it back, as necessary for ID and Baud Rate. Raises the errors of `read`."""
         entry = self.table[register]
         data = list(entry.encode(value))
 
@@ -163,14 +161,14 @@ class Servo:
         self._try(f"writing {value} to {register}", send, attempts)
 
     def let_answer(self) -> None:
-        """Set Status Return Level to 2 if the servo answers pings (as at level 0). Raises the same errors as `ping`."""
+        """Set Status Return Level to 2 if the servo answers pings, as it does at level 0. Raises `ping`'s errors."""
         self.ping(attempts=1)
         with suppress(NoReply):
             self.write_only("Status Return Level", 2, attempts=1)
         self.answered_pings_only = True
 
     def hardware_error(self) -> HardwareError:
-        """Return the Hardware Error Status, the reason for a raised alert bit. Raises the same errors as `read`."""
+        """Return the Hardware Error Status, the reason for a raised alert bit. Raises the errors of `read`."""
         return HardwareError(self.read("Hardware Error Status"))
 
     def _try(

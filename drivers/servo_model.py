@@ -50,11 +50,11 @@ supply voltage: supplies sag, and resistance and no-load speed differ by tens of
 """
 
 LEAST_OF_MEASURED = 0.75
-"""Used in place of `LEAST_SUPPLY` if the supply was measured: it may sag between two readings, and motors differ."""
+"""Replaces `LEAST_SUPPLY` if the supply was measured, since it may sag between two readings, and motors differ."""
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
-"""A current below the first fraction of its goal may also mean that torque is switched off. The second value then
-replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
+"""A current below the first fraction of its goal may also be due to switched-off torque. The second value then replaces
+`LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
 """
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
@@ -91,7 +91,7 @@ class Published(NamedTuple):
     """A published torque constant: the median, lowest and highest of the figures.
 
     It is uncertain even where the figures agree: an individual servo's stall torque can differ by tens of percent. If
-    it matters, measure the constant with a known weight.
+    that matters, measure the constant with a known weight.
     """
 
     value: float
@@ -149,7 +149,8 @@ class ServoModel:
         return self.no_load.voltage / self.no_load.speed
 
     def is_out_of_voltage(self, goal: float, carried: float, velocity: float, supply: float = math.nan) -> bool:
-        """Whether a current falls short of its goal because the supply cannot drive more through the turning motor.
+        """Whether a current falls short of its goal because the voltage is too low to drive it through the turning
+        motor.
 
         This is taken as the cause if the motor turns in the direction of its goal and the voltage across its terminals
         (voltage drop of the winding plus back-EMF) is about the supply voltage.
@@ -176,17 +177,15 @@ class ServoModel:
 
     @property
     def torque_per_ampere(self) -> Published:
-        """Torque constant at the output shaft [N m/A]: stall torque divided by stall current, and other published
-        values.
-        """
+        """Torque constant at the output shaft [N m/A]: stall torque over stall current, and other published values."""
         return _spread([stall.torque / stall.current for stall in self.stalls] + list(self.other_constants))
 
     @property
     def torque_per_volt(self) -> Published:
         """Torque at the output shaft per volt at standstill [N m/V]: stall torque divided by supply voltage.
 
-        In PWM mode, the motor torque is this value times the applied voltage, minus the back-EMF, which identified
-        viscous friction then includes.
+        In PWM mode, the motor torque is this value times the applied voltage, minus the effect of back-EMF, which the
+        identified viscous friction then includes.
         """
         return _spread([stall.torque / stall.voltage for stall in self.stalls])
 

@@ -285,7 +285,7 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
 
 
 def _told(statuses: Sequence[Status | None]) -> Status | None:
-    """Return the combined status of one joint's servos: goals are summed; a fault of any servo counts."""
+    """Return the combined status of one joint's servos: goals are summed; a fault of any servo applies to the joint."""
     told = [status for status in statuses if status is not None]
     if len(told) < len(statuses):
         return None

@@ -133,7 +133,7 @@ class SyncRead:
     def __init__(self, ids: Sequence[int], span: Span | Sequence[Span]) -> None:
         self._ids = tuple(ids)
         self.in_any_order = False
-        """Whether answers are accepted in any order, as needed if only some of them are late."""
+        """Whether answers are accepted in any order, as is necessary if only some of them are late."""
         spans = one_each(span, len(self._ids))
         self._values = {servo_id: Struct(f"<B{own.format}") for servo_id, own in zip(ids, spans, strict=True)}
         span = spans[0]
@@ -270,7 +270,7 @@ class FastSyncRead:
         return received[at:] if at >= 0 else b""
 
     def _intact(self, packet: bytes) -> Iterator[tuple[int, int]]:
-        """Yield the addressed ID and the start of each part before the first missing or damaged one."""
+        """Yield the addressed ID and the start of each part that precedes the first missing or damaged one."""
         for servo_id, start, end in self._parts:
             if len(packet) < end or _crc(packet[: end - 2]) != int.from_bytes(packet[end - 2 : end], "little"):
                 return

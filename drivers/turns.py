@@ -34,7 +34,7 @@ class Turns:
         self.usual, self.between = left, 0
 
     def due(self, between: bool) -> int:
-        """Return the span to read now, with all cycles including this one counted; 0 is the usual one."""
+        """Return the span to read now; 0 is the usual one. All cycles, including this one, must have been counted."""
         if self._until_slow <= 0 and not between:
             self._until_slow = self._slow_every
             # If a status is due as well, it waits for the next cycle, so that the two long reads never coincide.

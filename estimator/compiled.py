@@ -16,9 +16,7 @@ PACKAGE = __name__.split(".", maxsplit=1)[0]
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Any:
-    """Compile `function` to run without the GIL, cached on disk until its code, or any code or constant it uses,
-    changes.
-    """
+    """Compile `function` to run without the GIL, cached on disk until any code or constant that it contains changes."""
     dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     # numba has no public name for this; without it the cache would only check the date of one file, as numba's own
     # cache does.
@@ -69,7 +67,7 @@ def code_digest(function: Callable[..., Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return the Python function behind a compiled one; anything else unchanged."""
+    """Return the Python function behind a compiled one, or anything else unchanged."""
     return getattr(value, "py_func", value)
 
 

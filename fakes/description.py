@@ -33,7 +33,7 @@ class DescriptionError(ValueError):
 
 
 class FakeServo(Described):
-    """The initial state of one servo on the bus: set up for its arm, powered, torque off."""
+    """The initial state of one servo on the bus: set up for its arm and powered, with torque off."""
 
     id: Annotated[int, Field(ge=0, le=MAX_ID, description="bus ID")]
     model: Annotated[str, Field(description='name as printed on the servo, e.g. "XM430-W350"')]
@@ -192,9 +192,7 @@ def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def found_beside(folder: Path, name: str) -> Path:
-    """Return the file that a TOML file in `folder` refers to as `name` or, if that does not exist, its namesake in
-    `folder`.
-    """
+    """Return the file `name` of a TOML file in `folder` or, if it does not exist, its namesake in `folder` itself."""
     named = folder / name
     return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name
 

@@ -9,8 +9,8 @@ Time is that of `port.clock`: a program that waits must wait on that clock (or i
 not move the arm. In particular, dynamixel-sdk's own port handler, which polls with timeout 0 against `time.time()`,
 receives no replies. With `fake://PATH/TO/ARM.toml?time=real`, the arm runs in real time and works with any program.
 
-An unplugged cable (see `hil.fakes.bus.faults`) fails as on Linux: writing and reading raise `serial.SerialException`,
-`reset_input_buffer` raises `termios.error`. The port must then be closed and reopened once the cable is replugged.
+An unplugged cable (see `hil.fakes.bus.faults`) acts as on Linux: writing and reading raise `serial.SerialException`,
+and `reset_input_buffer` raises `termios.error`. The port must then be closed and reopened once the cable is replugged.
 """
 
 import errno

@@ -232,7 +232,7 @@ class PtyServer:
 
 
 def _baud_of(master: int) -> int:
-    """Return the baud rate that the host has set on the other end; 0 if it cannot be determined.
+    """Return the baud rate that the host has set at the other end; 0 if it cannot be determined.
 
     termios only returns standard rates; the Linux-specific call used here also returns others, such as 4.5 MBd.
     """

@@ -1,4 +1,4 @@
-"""Socket access to the simulated hand that moves a fake arm, which another process serves on a terminal.
+"""Socket access to the simulated hand that moves a fake arm served on a terminal by another process.
 
 A request is the text `move ID:to=ANGLE,...`, `release ID` or `release`; the reply is empty, or the error message.
 """

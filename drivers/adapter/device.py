@@ -58,9 +58,9 @@ def true_baud(descriptor: int) -> int | None:
 
 
 def adapter_name(device: str, sysfs: Path = _SYSFS) -> str:
-    """Return a persistent name for a device's USB adapter: replugging may change the device path, but not this name.
+    """Return a name for a device's USB adapter that, unlike the device path, stays the same after replugging.
 
-    Returns "" if the adapter has no serial number, or if another adapter that is plugged in has the same one.
+    Returns "" if the adapter has no serial number, or if another adapter that is plugged in has the same number.
     """
     if "://" in device:
         return ""

@@ -1,8 +1,8 @@
 """The USB adapter's latency timer: how long the adapter may hold back a reply.
 
 FTDI adapters (including the U2D2) buffer received data until 62 bytes have arrived or a timer has expired. The factory
-setting of 16 ms limits the control cycle to 60 Hz. On Linux the timer is set in a sysfs file of the tty that only root
-may write; the port's "low latency" flag also sets it to 1 ms, and any user of the port may set that flag.
+setting of 16 ms limits the control cycle to 60 Hz. On Linux, root may set the timer in a sysfs file of the tty; the
+port's "low latency" flag, which any user of the port may set, sets the timer to 1 ms.
 """
 
 from pathlib import Path
@@ -11,9 +11,7 @@ FACTORY_MS = 16
 WANTED_MS = 1
 
 LOCAL_S = 1e-3
-"""Latency allowed for a device without a latency timer [s]: a CDC-ACM adapter (one USB frame), a UART, a pty, the fake
-bus.
-"""
+"""Latency allowed for a device without a latency timer [s]: CDC-ACM adapter (one USB frame), UART, pty or fake bus."""
 
 REMOTE_S = 16e-3
 """Latency allowed for a port on a network [s]."""
@@ -34,7 +32,7 @@ def latency_timer(url: str, sysfs: Path = _SYSFS) -> Path | None:
 
 
 def read_latency_ms(file: Path) -> int:
-    """Return the timer's value [ms]; if the adapter has just been unplugged, the factory setting."""
+    """Return the timer's value [ms], or the factory setting if the adapter has just been unplugged."""
     try:
         return int(file.read_text())
     except (OSError, ValueError):

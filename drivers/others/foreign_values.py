@@ -1,12 +1,12 @@
-"""Detection of servo values that this program cannot have written and that are read too often for this to be chance."""
+"""Detection of servo values that this program cannot have written and that are read too often to be chance."""
 
 from collections import deque
 
 __all__ = ["ForeignValues"]
 
 ENOUGH, WITHIN_S = 3, 10.0
-"""This many values not written by this program, read within this time [s], prove that something else writes to the
-servo or alters what is written.
+"""Number of values not written by this program that, if read within this time [s], prove that something else writes to
+the servo or alters what is written.
 """
 
 

@@ -20,16 +20,16 @@ _FRONT_SIZE = 8  # header, ID, LEN, INST
 _BEFORE_LENGTH = 7  # header, ID, LEN
 _BESIDE_DATA = 4  # INST, ERR, CRC
 _LONGEST_CUT_OFF = 64
-"""Largest LEN of a truncated instruction that is recognised as such; a damaged LEN is usually larger."""
+"""Largest LEN at which a truncated instruction is recognised as such; a damaged LEN is usually larger."""
 
 _LEAST_REPEATED = 4
-"""Minimum length of part of a reply that is recognised when it arrives again [bytes]."""
+"""Minimum length at which part of a reply is recognised when it arrives again [bytes]."""
 
 _PART_OF_A_REPLY = 8  # bytes; at least the header of a fast reply, whose first servos have then answered
 
 
 class Heard:
-    """Packets of other masters, and late, repeated, damaged or foreign replies, for a fixed list of servos.
+    """Recognises other masters' packets, and late, repeated, damaged or foreign replies, for a fixed list of servos.
 
     ids: the servos' IDs. reads: the group reads that are sent.
     """
@@ -43,13 +43,13 @@ class Heard:
         reply that was certainly a repetition [s on the port's clock].
         """
         self.latest = b""
-        """What was received in reply to the latest request."""
+        """Bytes received in reply to the latest request."""
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """Number of replies, since the last late one, with one answer per servo but IDs not matching the request."""
+        """Number of replies since the last late one that contain one answer per servo but not the requested IDs."""
         self.strangers: float = 0
-        """Number of received packets that this program neither sent nor requested, but another master did."""
+        """Number of received packets that another master sent or requested."""
 
     def expect(self, reads: Iterable[GroupRead]) -> None:
         """From now on, treat replies to these reads as replies to this program."""
@@ -74,7 +74,7 @@ class Heard:
         self.late_at, self.mixed_up = now, 0
 
     def instead(self, read: GroupRead, received: bytes, answers: Sequence[Answer], now: float, *, echoes: bool) -> None:
-        """Examine bytes received instead of the regular reply to `read`; `answers` were found in them."""
+        """Examine bytes received instead of the regular reply to `read`; `answers` are those found in them."""
         self.beside(received, echoes=echoes)
         if any(front in self._expected - read.expected for front in _fronts_of_replies(received)):
             self._was_late(now)  # the beginning of a reply to an earlier request
@@ -100,7 +100,7 @@ class Heard:
             self._was_late(now)
 
     def advice(self, now: float, url: str) -> str:
-        """Return advice on bytes received in the last 0.1 s instead of complete and timely replies; "" if none."""
+        """Return advice on irregular replies and other bytes received in the last 0.1 s; "" if there were none."""
         since = now - _RECENT_S
         if self.repeated_at > since:
             return "Replies are repeated in transit and collide with what is sent: check the adapter and the cables."
@@ -135,20 +135,20 @@ class Heard:
     def _is_strange(self, packet: Packet) -> bool:
         """Whether this is another master's instruction or a reply to one.
 
-        An error without data may be a reply to this program.
+        An error reply without data may be meant for this program.
         """
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
 
     def _is_anothers(self, servo_id: int, length: int) -> bool:
-        """Whether a truncated instruction is another master's, not a damaged reply with that LEN."""
+        """Whether a truncated instruction is another master's and not a damaged reply with this LEN."""
         lengths = {size + _BESIDE_DATA for _, size in self._expected}
         return servo_id in (*self._ids, BROADCAST_ID) and length <= _LONGEST_CUT_OFF and length not in lengths
 
 
 def _packets_within(received: bytes) -> list[Packet]:
-    """Return all complete packets, including those after or within one cut off by a collision."""
+    """Return all complete packets, including those that follow or lie within a packet cut off by a collision."""
     found: list[Packet] = []
     at = received.find(HEADER)
     while at >= 0:

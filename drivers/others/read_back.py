@@ -14,7 +14,7 @@ from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRea
 __all__ = ["TRY_AGAIN_S", "Overruled", "ReadBack", "pause_after"]
 
 GOALS, MODES, TORQUE = range(3)
-"""What is read back, as indices of `ReadBack.reads`."""
+"""Kinds of read-back, as indices into `ReadBack.reads`."""
 
 _OTHERS_S = {MODES: 0.025, TORQUE: 0.1}
 """Mean time between two read-backs of the modes, and of Torque Enable [s]; in between, the goals are read back.
@@ -24,17 +24,17 @@ modes are read.
 """
 
 _GOALS_PER_OTHER_IN_DOUBT = 4
-"""Minimum number of goal read-backs between two other read-backs while a foreign value is suspected."""
+"""Minimum number of goal read-backs between two read-backs of other kinds while a foreign value is suspected."""
 
 _RECENT = 4
-"""Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
+"""After lost writes, a servo may still hold any of the latest `_RECENT` goals; the status detects longer losses."""
 
 _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Numbers of read-backs of a foreign value that prove another writer, and the time within which they must occur [s].
 
-Three of the same value are required for a goal that this program may have written in an earlier cycle, and for 0, which
-a servo itself may have set. By then, the status would have revealed lost writes, a tripped watchdog or a reboot; and
-writes that are lost occasionally leave a different goal each time.
+Three read-backs of the same value are required for a goal that this program may have written in an earlier cycle, and
+for 0, which a servo itself may have set. By then, the status would have revealed lost writes, a tripped watchdog or a
+reboot; and writes that are lost occasionally leave a different goal each time.
 """
 
 _UNSURE_S = 0.01
@@ -58,7 +58,7 @@ detected. Every fourth such read-back is of Torque Enable.
 
 _DELAYED_SHARE, _DELAYED_SHARE_IN_DOUBT = 0.01, 0.1
 """Ratio of the delay caused by an overdue read-back to the longest time until the next one; the second value applies
-while a foreign value is suspected. If the delay is short, read-backs are thus made more often than every `OVERDUE_S`.
+while a foreign value is suspected. If the delay is short, read-backs are thus less than `OVERDUE_S` apart.
 """
 
 LOST_GOALS, LOST_OF = 3, 6
@@ -94,9 +94,9 @@ def pause_after(delay: float, share: float = _DELAYED_SHARE) -> float:
 class ReadBack:
     """Reads back the goals that the servos hold right before a cycle, and occasionally other registers instead.
 
-    goal: a span of Bus Watchdog and goal. mode: a span that ends with the settings; `modes` are their values, the
-    same number for each servo. A change to one of these settings reverses the motor, shifts every angle, or changes the
-    meaning of goals. torque: a span that begins with Torque Enable. watches_torque: whether Torque Enable is read
+    goal: a span of Bus Watchdog and goal. mode: a span that ends with the settings; `modes` holds each servo's values.
+    A change to one of these settings reverses the motor, shifts every angle, or changes the meaning of goals. torque: a
+    span that begins with Torque Enable. watches_torque: whether Torque Enable is read
     back regularly, as is necessary if no status shows it. interval: time between two cycles [s], 0 if unknown.
 
     If a cycle leaves no time to read all servos, only one is read (`alone`); the servos take turns.
@@ -122,9 +122,7 @@ class ReadBack:
         self.reads: tuple[GroupRead, ...] = tuple(kind(ids, span) for span in spans)
         self._alone = [list(map(_of_one, ids, one_each(span, len(ids)))) for span in spans]
         self.longest = 0.0
-        """Duration of the longest recent read-back, without its wire time [s]; it decays from one read-back to the
-        next.
-        """
+        """Duration of the longest recent read-back, without wire time [s]; it decays from one read-back to the next."""
         self._longest_again = _AGAIN_SHARE * interval if interval <= _SHORT_CYCLE_S else 0.0
         self._repeated_at = -math.inf
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
@@ -153,14 +151,14 @@ class ReadBack:
         self._missed: list[deque[int]] = [deque(maxlen=LOST_GOALS) for _ in ids]
         """Indices of the latest read-backs that found an older goal of this program, by servo."""
         self.watchdogs: list[tuple[int, int]] = []
-        """Index and Bus Watchdog of each servo that answered the latest read-back, if that was of goals."""
+        """Index and Bus Watchdog of each servo that answered the latest read-back, if it read goals."""
         self.torque_off: int | None = None
         """Index of a servo whose Torque Enable read 0 when it was last read back; None if there is none."""
         self.overdue_at = math.inf
         """Time from which a read-back may delay a cycle if nothing is read back before then [s]."""
         self.doubts_until = -math.inf
         self.sighted: Overruled | None = None
-        """The latest value read back that this program did not write; it is treated as recent until `doubts_until`."""
+        """The latest read-back value that this program did not write; it counts as recent until `doubts_until`."""
 
     @property
     def read(self) -> GroupRead:
@@ -190,9 +188,9 @@ class ReadBack:
         self.overdue_at = min(self.overdue_at, now + OVERDUE_S)
 
     def delayed(self, now: float, delay: float, *, alone: bool) -> None:
-        """Account for a read-back that has delayed the next cycle by `delay` [s]; 0 if it has not.
+        """Account for a read-back that has delayed the next cycle by `delay` [s], which may be 0.
 
-        alone: whether only one servo was read, which counts as the corresponding share of a read-back of all.
+        alone: whether only one servo was read; the next read-back is then due correspondingly sooner.
         """
         if delay == 0.0 and self._was_of_goals and now >= min(self._due.values()):
             return  # what is due did not fit
@@ -202,7 +200,7 @@ class ReadBack:
         self.overdue_at = min(due, now + pause)
 
     def may_repeat(self, now: float, takes: float) -> bool:
-        """Whether to repeat at once a lost read-back that takes `takes` [s]."""
+        """Return whether a lost read-back is to be repeated at once, which takes `takes` [s]."""
         if takes >= self._longest_again or now <= self._repeated_at + TRY_AGAIN_S:
             return False
         self._repeated_at = now
@@ -268,7 +266,7 @@ class ReadBack:
         return None
 
     def _are_latest(self, servos: Sequence[Answer], goals: Sequence[int]) -> bool:
-        """Return whether all servos hold their latest goals and report no error, as usual."""
+        """Return whether all servos hold their latest goals and report no error, which is the usual case."""
         watchdogs: list[tuple[int, int]] = []
         for answer, goal in zip(servos, goals, strict=True):
             if not answer or answer[0] or answer[-1] != goal:
@@ -324,7 +322,7 @@ class ReadBack:
         return found
 
     def _count_missed(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> None:
-        """Count goals that did not arrive, i.e. servos that still hold an earlier goal from this program."""
+        """Count a missed goal for each servo that still holds an earlier goal from this program."""
         before = list(islice(reversed(sent), 1, _RECENT))
         for place, (answer, missed) in enumerate(zip(servos, self._missed, strict=True)):
             if answer is None or answer[-1] == sent[-1][place] or all(answer[-1] != each[place] for each in before):
@@ -335,7 +333,7 @@ class ReadBack:
 
 
 def _of_one(servo_id: int, span: Span) -> GroupRead:
-    """Return a read of one servo: not a fast one, which would be no shorter."""
+    """Return a read of one servo; a fast read would be no shorter."""
     return SyncRead((servo_id,), span)
 
 

@@ -1,4 +1,4 @@
-"""How often the servos are read: exchanges per sample and status reads between them, as far as wire time allows."""
+"""Number of exchanges per sample, and of exchanges between two status reads, within the limits of wire time."""
 
 import math
 from collections.abc import Sequence
@@ -25,10 +25,10 @@ the supply current, which is slow to reveal a loss of torque.
 def cadence(
     sample: float, port: Port, drives: Sequence[Joint], tables: Sequence[ControlTable], return_delay: float
 ) -> tuple[int, Spans | None, int]:
-    """Return the exchanges per sample, the status registers, and the number of exchanges between two reads of these.
+    """Return the number of exchanges per sample, the status registers, and the number of exchanges per status read.
 
-    The registers are None if there is no time to read them. sample: time between two samples [s], 0 if unknown. drives:
-    one entry per servo. return_delay: the servos' longest Return Delay Time [s].
+    The registers are None if there is no time to read the status. sample: time between two samples [s], 0 if unknown.
+    drives: one entry per servo. return_delay: the servos' longest Return Delay Time [s].
     """
     if not sample:
         return 1, None, 0

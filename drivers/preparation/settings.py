@@ -27,8 +27,8 @@ PROTECTIVE = (
     "PWM Slope",
     SECONDARY_ID,
 )
-"""EEPROM registers that determine when a servo protects itself and which IDs it obeys. An experiment does not set
-them, but restores them if another program has changed them in the meantime.
+"""EEPROM registers that determine when a servo protects itself and which IDs it obeys. An experiment does not set them,
+but restores them if another program has changed them.
 
 Other writable EEPROM registers are not restored:
 - PWM Limit, Drive Mode, Homing Offset, Return Delay Time: the user may have wanted the change, and restoring it
@@ -76,10 +76,10 @@ WATCHDOG_TRIPPED = 0xFF
 
 
 def read_settings(servo: Servo) -> dict[str, int]:
-    """Return the registers that an experiment may change, by name [ticks]. Raises the same errors as `Servo.read`.
+    """Return the registers that an experiment may change, by name [ticks]. Raises the errors of `Servo.read`.
 
-    All are read twice, the second time in reverse order. A reply does not identify its register: one to an earlier
-    request could otherwise be stored, and later restored, as the value of another register.
+    All are read twice, the second time in reverse order, because a reply does not identify its register: a reply to an
+    earlier request could be stored, and later restored, as the value of another register.
     """
     names = [name for name in (*EEPROM, *RAM) if name in servo.table]
     settings = {name: servo.read(name) for name in names}
@@ -97,10 +97,10 @@ def read_settings(servo: Servo) -> dict[str, int]:
 
 
 def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
-    """Return the settings with goals clamped to the limits, which another program may have lowered since.
+    """Return the settings with goals clamped to the limits, which another program may have lowered meanwhile.
 
-    A limit that is among the settings is restored before its goal; for any other limit, the servo's present value
-    applies. Raises the same errors as `Servo.read`.
+    A limit that is itself in `settings` is restored before its goal; otherwise, the servo's present limit applies.
+    Raises the errors of `Servo.read`.
     """
     cut = dict(settings)
     for goal, limit in _BOUNDS.items():
@@ -111,7 +111,7 @@ def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
 
 
 AS_BEFORE = "all other settings are as before."
-"""End of the message of an error that left only some registers in doubt."""
+"""End of the message of an error after which only some registers are in doubt."""
 
 
 def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, int]]:
@@ -150,8 +150,8 @@ def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | 
     """Return the name of a register that determines how a servo moves (EEPROM, a goal or the Bus Watchdog) and differs
     from `settings`, with its value and the one in `settings`; None if there is no such register.
 
-    Registers are read in the reverse order of `put_back`, so that replies to earlier requests do not match again.
-    Raises the same errors as `Servo.read`.
+    Registers are read in the reverse order of `put_back`, so that replies that lag behind their requests cannot match
+    both times. Raises the errors of `Servo.read`.
     """
     wanted = attainable(servo, settings)
     for name in reversed((*EEPROM, *_BOUNDS, "Bus Watchdog")):
@@ -161,9 +161,7 @@ def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | 
 
 
 def arms_itself(servo: Servo) -> bool:
-    """Return whether this servo switches torque on by itself at power-up or reboot. Raises the same errors as
-    `Servo.read`.
-    """
+    """Return whether this servo switches torque on by itself at power-up or reboot. Raises `Servo.read`'s errors."""
     with suppress(DriverError):
         return bool(servo.read_entry(STARTUP_CONFIGURATION) & TORQUE_ON_AT_STARTUP)
     return False  # older firmware has no such register

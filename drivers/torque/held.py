@@ -1,4 +1,4 @@
-"""Torque that is already on at the start: either refuse to start, or take over and let the arm sink slowly."""
+"""Handling of torque that is already on at the start: either refuse to start, or let the arm sink slowly."""
 
 from collections.abc import Mapping
 
@@ -21,7 +21,7 @@ _STILL_TICKS = 2  # Present Velocity below which a joint counts as still
 
 
 def is_held(servo: Servo) -> bool:
-    """Return whether the servo's torque is on and holds or drives its joint. Raises the same errors as `Servo.read`.
+    """Return whether the servo's torque is on and holds or drives its joint. Raises the errors of `Servo.read`.
 
     A tripped Bus Watchdog has zeroed the goal, so that in current and PWM mode the joint moves freely. Torque Enable is
     read twice, because a reply does not identify its register.
@@ -45,7 +45,7 @@ def refuse_held(servos: Mapping[Joint, Servo]) -> None:
 
 
 def switched_on(servos: Mapping[Joint, Servo]) -> str:
-    """Describe the servos with torque on and their currents; "" if none. Raises the same errors as `Servo.read`."""
+    """Describe the servos with torque on and their currents; "" if none. Raises the errors of `Servo.read`."""
     on = [servo for servo in servos.values() if servo.read("Torque Enable") and has_torque(servo)]
     return " and ".join(f"{servo.title}{_current(joint, servo)}" for joint, servo in servos.items() if servo in on)
 
@@ -59,8 +59,7 @@ def _current(joint: Joint, servo: Servo) -> str:
 def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
     """Ramp the output of held servos down to zero, wait until the joints no longer sink, then cut torque.
 
-    With zero PWM and torque on, the motor's terminals are shorted, so it brakes. Raises the same errors as
-    `Servo.write`.
+    With zero PWM and torque on, the motor's terminals are shorted, so it brakes. Raises the errors of `Servo.write`.
     """
     held = {joint: servo for joint, servo in servos.items() if is_held(servo)}
     goals = {joint: _what_drives(servo) for joint, servo in held.items()}

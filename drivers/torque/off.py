@@ -1,11 +1,11 @@
 """Cutting torque: torque off is sent to every servo and read back, regardless of failures and interrupts.
 
 The order matters. Every packet feeds the Bus Watchdog of every servo that receives it, whatever ID it addresses. If a
-servo receives packets but does not obey, because it refuses them or its ID has changed, only its watchdog stops its
-current. So torque off is first sent to all servos at once, which takes 0.3 ms; then each servo is polled until one does
-not reply. From then on, the bus stays silent until the Bus Watchdogs time out. If a servo is already silent before
-torque is cut, torque off is sent three times, since a packet may be lost, and the silence begins at once. After the
-silence, all servos not yet confirmed are polled again, several times.
+servo receives packets but does not obey, because it refuses them or its ID has changed, only its watchdog can stop its
+current. Torque off is therefore first sent to all servos at once, which takes 0.3 ms; then each servo is polled until
+one does not reply. From then on, the bus stays silent until the Bus Watchdogs time out. If a servo is already silent
+before torque is cut, torque off is sent three times, since a packet may be lost, and the silence begins at once. After
+the silence, all servos not yet confirmed are polled again, several times.
 
 Ctrl-C raises KeyboardInterrupt at any point of the program, even between two servos while torque is being cut. A
 program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
@@ -31,7 +31,7 @@ from hil.drivers.servo_model import WATCHDOG_UNIT, Mode
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _INTERRUPTS_BORNE = 5
-"""Number of interrupted attempts (Ctrl-C) after which confirming torque off for a servo counts as failed."""
+"""Number of attempts interrupted by Ctrl-C after which cutting a servo's torque counts as failed."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
 """Maximum delay of a watchdog beyond its timeout [s], since it counts in steps of 20 ms."""
@@ -46,13 +46,12 @@ class TorqueOff:
 
     confirmed: joints whose servos were read back as off.
     unconfirmed: the other joints, each with the reason.
-    unwatched: joints, of either group, whose servos have no Bus Watchdog.
+    unwatched: joints of either group whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
     rebooted: confirmed joints whose servos were reset, and so lost the watchdog armed before torque was switched on.
     disarmed: confirmed joints whose servos lost only this watchdog, which another program switched off.
     tripped: joints whose Bus Watchdog may have tripped, which zeroes their goals; it has been cleared since.
-    driven: joints in neither group, whose servos' torque is on because another program switches it on whenever it is
-    cut.
+    driven: joints in neither group, because another program switches their servos' torque on whenever it is cut.
     """
 
     confirmed: tuple[Joint, ...]
@@ -72,7 +71,7 @@ class TorqueOff:
     def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
         """Return the report after another program has switched torque on again.
 
-        on: joints whose servos have torque on again each time it is cut. silent: joints whose servos have not
+        on: joints whose servos' torque is on again each time it is cut. silent: joints whose servos have not
         answered since.
         """
         why = "Another program had switched its torque on again, and it has not answered since."
@@ -84,7 +83,7 @@ class TorqueOff:
         )
 
     def with_later(self, joint: Joint, *, rebooted: bool | None) -> "TorqueOff":
-        """Return the report with a joint confirmed whose servo has answered again and reads back as off.
+        """Return the report with a joint now confirmed, since its servo has answered again and reads back as off.
 
         rebooted: result of `was_rebooted`.
         """
@@ -118,9 +117,7 @@ class TorqueOff:
                 )
 
     def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:
-        """Yield each reason why servos are unconfirmed, with their joints; reasons that differ only in the joint's name
-        are merged.
-        """
+        """Yield the reasons why servos are unconfirmed, each with its joints; see `by_reason`."""
         yield from by_reason(self.unconfirmed).items()
 
     def _outcome(self) -> str:
@@ -241,7 +238,7 @@ def _tell(port: Port, servos: Mapping[Joint, Servo], register: str, value: int, 
 def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> frozenset[Joint]:
     """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more.
 
-    Return the joints whose watchdog has tripped, or may have: this cannot be read afterwards.
+    Return the joints whose watchdog has or may have tripped, which cannot be read afterwards.
     """
     tripped = set(servos)
 
@@ -260,7 +257,7 @@ def cut_again(servo: Servo, *, armed: bool) -> bool | None:
     """Cut the torque of a servo that did not answer before; return whether it was rebooted, as `was_rebooted` does.
 
     armed: whether its Bus Watchdog was armed before torque was switched on; if so, the watchdog is switched off. Raises
-    the same errors as `Servo.write`.
+    the errors of `Servo.write`.
     """
     if servo.read_despite_error("Torque Enable"):
         servo.write_despite_error("Torque Enable", 0)
@@ -280,8 +277,8 @@ def is_torque_on(servo: Servo) -> bool | None:
 def has_torque(servo: Servo) -> bool | None:
     """Read whether a servo's torque is on; None if its answers may belong to other requests.
 
-    A reply does not identify its register, so Torque Enable is read twice, with another register in between.
-    Raises the same errors as `Servo.read`.
+    A reply does not identify its register, so Torque Enable is read twice, with another register in between. Raises the
+    errors of `Servo.read`.
     """
     first = servo.read_despite_error("Torque Enable")
     is_its_own = servo.read_despite_error("ID") == servo.id
@@ -289,7 +286,8 @@ def has_torque(servo: Servo) -> bool | None:
 
 
 def was_rebooted(servo: Servo) -> bool | None:
-    """Whether a servo whose watchdog is no longer armed was rebooted; None if it is armed, or if nothing is known.
+    """Whether a servo whose watchdog is no longer armed was rebooted; None if the watchdog is armed or nothing is
+    known.
 
     A reboot also resets the goal to its limit; a program that only writes to the watchdog leaves the goal as it is. A
     late reply to an earlier request could be mistaken for the answer, so another register is read before and after.
@@ -302,7 +300,7 @@ def was_rebooted(servo: Servo) -> bool | None:
 
 
 def _confirm(servo: Servo, interrupts: list[BaseException], *, at_once: bool) -> Exception | None:
-    """Write torque off and read it back; return None, or the failure.
+    """Switch torque off and read it back; return None, or the failure.
 
     at_once: try only once, and send nothing after a missing reply.
     """

@@ -202,8 +202,8 @@ class TorqueSwitch:
     def confirm_later(self, drive: Joint) -> bool:
         """Cut the torque of a servo (a key of `drives`) that `torque_off` could not confirm as off, and read it back.
 
-        Returns False if there was nothing to do; otherwise `torque_off_report` then lists the servo as confirmed.
-        Raises DriverError if the servo still does not answer.
+        Returns False if there was nothing to do; otherwise, `torque_off_report` lists the servo as confirmed
+        afterwards. Raises DriverError if the servo still does not answer.
         """
         report = self.torque_off_report
         if report is None or drive not in [joint for joint, _ in report.unconfirmed]:

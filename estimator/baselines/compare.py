@@ -1,7 +1,7 @@
 """Comparison with other methods on the same settled period, each tuned and timed.
 
-All methods receive the same positions and commands. Their torque is the command, delayed by hil's estimate from stage
-1, so that none has to estimate the delay. Each method is tuned by trying several settings and keeping those whose
+All methods receive the same positions and commands. As torque, they use the command, delayed by hil's estimate from
+stage 1, so that none has to estimate the delay. Each method is tuned by trying several settings and keeping those whose
 simulation is closest to the recording; only the run time with these settings is reported.
 """
 
@@ -39,7 +39,7 @@ class Peer:
 
     name: str
     parameters: dict[str, float]
-    """Base parameters, and any others needed to simulate the result, by name [SI]."""
+    """Base parameters, and any other parameters needed to simulate the result, by name [SI]."""
     std: dict[str, float]
     """Standard errors as reported by the method, by name [SI]."""
     seconds: float

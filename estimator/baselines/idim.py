@@ -72,7 +72,7 @@ def filtered_rows(
 ) -> Rows:
     """Return the rows of the regression; arguments as in `fit_inverse_dynamics`.
 
-    Raises RecordingError if the recording is too short or its rate too low for the filter.
+    Raises RecordingError if the recording is too short, or its rate is too low, for the filter.
     """
     position, torque, dt = uniform(recording, delay)
     trim = int(np.ceil(TRIM / (cutoff * dt)))

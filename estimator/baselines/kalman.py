@@ -2,7 +2,7 @@
 
 State: angles, velocities, base parameters. Between samples the motion is integrated by Runge-Kutta steps under the mean
 motor torque; the parameters are constant except for a little process noise; each sample corrects the whole state. EKF:
-Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with the Jacobian of the integrated step by finite
+Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with the integrated step's Jacobian from finite
 differences. UKF: Julier and Uhlmann, Proc. IEEE 92 (2004) 401, symmetric sigma points.
 
 The filters are given every fair advantage: the likelihood's dynamics, an initial guess from filtered least squares with
@@ -92,7 +92,7 @@ def fit_by_kalman(
 
 
 def _scales(names: tuple[str, ...], start: Array) -> Array:
-    """Return the scale of each parameter: the largest magnitude among parameters of its kind."""
+    """Return the scale of each parameter, which is the largest magnitude among parameters of its kind."""
     groups = dict.fromkeys(("coupling", "armature"), "inertia") | dict.fromkeys(TORQUES, "torque")
     kinds = [groups.get(name.split("_")[0], name.split("_")[0]) for name in names]
     largest = {kind: max(abs(v) for v, k in zip(start, kinds, strict=True) if k == kind) for kind in kinds}

@@ -3,7 +3,7 @@
 Angles that are measured from a fixed direction instead of from the previous link are detected in the same way.
 
 If the torque of the only joint, or of all joints, is reversed, the residual stays the same but inertias and friction
-become negative. Reversing one of two joints contradicts the other joint's equations and so increases the residual.
+become negative. Reversing only one of two joints contradicts the other's equations and so increases the residual.
 """
 
 from collections.abc import Iterator, Sequence
@@ -147,7 +147,7 @@ def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = 
 
 
 def suspect_absolute_unzeroed(recordings: Sequence[Recording]) -> Absolute | None:
-    """Return the same evidence for recordings with unknown zeros: after the change, gravity determines them."""
+    """Like `suspect_absolute`, but for recordings with unknown zeros, which gravity determines after the change."""
     if recordings[0].joints != 2:
         return None
     apart = [_difference(each, 0.0) for each in recordings]

@@ -33,7 +33,7 @@ class Clipped:
     """A joint whose torque seems limited to `level` [N m], although the torque column exceeds it in a fraction `beyond`
     of the samples.
 
-    residual, residual_given: relative RMS of the joint's torque residual, with the limit and as given.
+    residual, residual_given: relative RMS of the joint's torque residual, with the limit and with the torque as given.
     """
 
     joint: int
@@ -64,7 +64,7 @@ class Late:
     """A joint whose torque column seems to be `delay` [s] later than those of the others; negative if earlier.
 
     residual, residual_given: relative RMS of the worst joint's torque residual, with the column shifted by `delay` and
-    as given.
+    with the column as given.
     """
 
     joint: int
@@ -112,8 +112,8 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
 
 
 def suspect_late(recordings: Sequence[Recording]) -> Late | None:
-    """Return the joint whose torque delay differs from that of the others, if a separate delay explains the motion much
-    better than a common one.
+    """Return the joint whose torque has a delay of its own, if this explains the motion much better than a common
+    delay.
     """
     joints = recordings[0].joints
     if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
@@ -166,9 +166,7 @@ def _delayed(recording: Recording, delays: Array) -> Recording:
 
 
 def suspect_drift(recordings: Sequence[Recording]) -> ClockDrift | None:
-    """Return the drift of the torque's delay if it explains the motion much better than a constant delay, otherwise
-    None.
-    """
+    """Return the drift of the torque's delay if it explains the motion much better than a constant delay, or None."""
     from scipy.optimize import minimize
 
     if sum(each.time.size for each in recordings) > MOST_SAMPLES:

@@ -44,9 +44,9 @@ TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 
 
 @dataclass(frozen=True)
 class Reversed:
-    """Reversed columns. residuals: relative RMS of the worst joint's torque residual with the change, and as given.
-    impossible: whether friction is negative as given, since all torques or the columns of a vertical first joint are
-    reversed.
+    """Reversed columns. residuals: relative RMS of the worst joint's torque residual with the change and without it.
+    impossible: whether friction is negative with the columns as given, as when all torques, or the columns of a
+    vertical first joint, are reversed.
     """
 
     residuals: tuple[float, float]
@@ -76,11 +76,11 @@ class Swapped:
 
 @dataclass(frozen=True)
 class Late:
-    """Torque logged `seconds` later than it acted; if negative, earlier. residuals: those of the joint's torque."""
+    """Torque logged `seconds` later than it acted, or earlier if negative. residuals: those of the joint's torque."""
 
     residuals: tuple[float, float]
     joint: int | None
-    """The joint, counted from 0; None if all torques are late; the residuals are then those of the worst joint."""
+    """The joint, counted from 0; None if all torques are late (the residuals are then the worst joint's)."""
     seconds: float
 
 
@@ -96,7 +96,7 @@ class _Solved:
         return float(self.relative.max())
 
     def distance(self, prior: Prior) -> float:
-        """Squared distance of the base parameters from the description, in standard deviations."""
+        """Squared distance of the base parameters from the description's, in the prior's standard deviations."""
         return float(np.sum(np.square((self.value[: prior.value.size] - prior.value) / prior.std)))
 
     @property
@@ -189,7 +189,7 @@ class ColumnCheck:
         return Swapped((worst, given), pair, said) if worst < min(CLEAR * given, WELL) else None
 
     def late_torque(self) -> Late | None:
-        """The delay of one joint's torque, or of all torques, that explains the recordings better than none."""
+        """The delay of one joint's torque, or of all torques, that explains the recordings better than no delay."""
         (Y, torque), (normal, given) = self._rows, self._given
         every = {late: self._filtered(self.recordings, late)[1] for late in DELAYS.tolist()}
 
@@ -216,9 +216,9 @@ class ColumnCheck:
         return Late(residuals, chosen, late) if is_late and residuals[0] < LATE * residuals[1] else None
 
     def contradictory_torques(self) -> tuple[float, ...] | None:
-        """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better than 1.
+        """Return torque factors relative to joint 1's (joints,) that explain the recordings better than equal factors.
 
-        The links' prior is weak and friction absorbs much of an error, so a small gain is evidence.
+        The links' prior is weak and friction absorbs much of an error, so even a small improvement is evidence.
         """
         normal, given = self._given
         factors, best = np.ones(self.model.joints), given
@@ -235,7 +235,7 @@ class ColumnCheck:
         return tuple(factors.tolist())
 
     def wrong_times(self) -> WrongTimes | None:
-        """The time scale that explains the recordings much better than 1, given gravity and the described geometry."""
+        """The time scale that, given gravity and the described geometry, explains the recordings much better than 1."""
         given = self._given[1]
         if not np.any(self.model.base.chain.gravity):
             return None
@@ -248,7 +248,7 @@ class ColumnCheck:
         return WrongTimes((worst, given.worst), factor) if worst < min(CLEAR * given.worst, WELL) else None
 
     def _slower(self, factor: float) -> float:
-        """The residual if the true times are those of the recordings divided by `factor`."""
+        """The residual on the assumption that the true times are those of the recordings divided by `factor`."""
         try:
             changed = [replace(each, time=each.time / factor) for each in self.recordings]
             return replace(self, recordings=changed, cutoff=self.cutoff * factor)._given[1].worst
@@ -256,7 +256,7 @@ class ColumnCheck:
             return np.inf
 
     def _dissipates_too_little(self, found: _Solved) -> bool:
-        """Whether more friction terms are significantly negative than positive, or all of one joint are negative."""
+        """Whether more friction terms are significantly negative than positive, or all of one joint's are negative."""
         start, joints = self.model.base.count, self.model.joints
         over = (found.value / found.std)[start : start + 2 * joints].reshape(2, joints)
         negative = over < -SIGNIFICANT
@@ -267,8 +267,8 @@ class ColumnCheck:
 class _Normal:
     """Normal equations of each joint's torques.
 
-    squares: (joints, names, names). products: those with the torque (joints, names). torque: mean square of the torque
-    (joints,).
+    squares: products of the columns (joints, names, names). products: products of columns and torque (joints, names).
+    torque: mean square of the torque (joints,).
     """
 
     squares: Array
@@ -284,7 +284,7 @@ class _Normal:
         return cls(squares, *_driven(columns, torque), rows)
 
     def driven_by(self, columns: Array, torque: Array) -> "_Normal":
-        """Return the equations for other torques; `columns`: as for `of`."""
+        """Return the equations for other torques; `columns` as for `of`."""
         return _Normal(self.squares, *_driven(columns, torque), self.rows)
 
     def solved(self, factors: Array, prior: Prior) -> _Solved:

@@ -74,8 +74,7 @@ class ChainEstimate(FittedParameters):
     zero error (true minus measured angle) [rad]. Empty if not tested.
     """
     noise_steps: Array
-    """Noise of one sample of each angle, encoder rounding included (joints,) [encoder steps]; rounding alone is 0.2887.
-    """
+    """Noise of one sample of each angle, including rounding (joints,) [encoder steps]; rounding alone is 0.2887."""
     at_bound: tuple[str, ...] = ()
     """Parameters at a bound although the data favour values beyond it; empty unless this affects base parameters."""
     conflicts: tuple[Conflict, ...] = ()
@@ -103,8 +102,8 @@ def identify_chain(
 ) -> ChainEstimate:
     """Estimate the parameters of `model` from settled periods by regression, then maximum likelihood.
 
-    `prior` supplies what the data barely constrain (`ChainEstimate.from_prior`). `added`: see `fit_lines`; for a
-    model with `added_mass`. test_zeros: whether to test the encoder zeros that `model` holds fixed
+    `prior` supplies what the data barely constrain (`ChainEstimate.from_prior`). `added`: as for `fit_lines`, if
+    `model` has `added_mass`. test_zeros: whether to test the encoder zeros that `model` holds fixed
     (`ChainEstimate.doubtful_zeros`), which takes 10 % longer. Raises ModelError if `model` and a period differ in
     their number of joints, ConvergenceError if no minimum is found.
     """
@@ -152,7 +151,7 @@ def identify_chain(
 
 
 def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int, float], ...]:
-    """Return the joints (from 1) whose fixed zeros are wrong significantly and by over LARGE_ZERO, and their errors.
+    """Return the joints (from 1) whose fixed zeros have significant errors larger than LARGE_ZERO, with these errors.
 
     A model error that widens the standard errors by the factor `systematic` can mimic zero errors, so it raises the
     threshold.
@@ -165,7 +164,7 @@ def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int
 def largest_ratio(one: Array, other: Array) -> float:
     """Return the largest element-by-element ratio of two vectors of standard errors; infinite if no pair is finite.
 
-    An unmodelled effect may act on only one joint.
+    The largest counts because an unmodelled effect may act on only one joint.
     """
     known = np.isfinite(one) & np.isfinite(other)
     return float(np.max(one[known] / other[known])) if known.any() else np.inf

@@ -163,7 +163,7 @@ def torque_error(recordings: Sequence[Recording], found: RecordedChain) -> Array
     """Return the RMS error of the torque that the parameters `found` predict for `recordings`, relative to the torque's
     RMS (joints,); NaN for joints that stand still.
 
-    At standstill, static friction balances any torque up to its level, so a smaller error does not count.
+    At standstill, static friction balances any torque up to its level, so an error below that level does not count.
     """
     scale = [found.parameters.get(f"torque_scale_{joint}", 1.0) for joint in range(1, found.model.joints + 1)]
     true = [replace(each, torque=each.torque * np.array(scale)[:, None]) for each in recordings]

@@ -28,7 +28,7 @@ class PeriodicMotion:
 
 
 def lines_of(signal: Array) -> Lines:
-    """Return the coefficients c_k (..., samples // 2 + 1) of a period (..., samples): the sum of c_k exp(j k w0 t)."""
+    """Return the coefficients c_k (..., samples // 2 + 1) of a period (..., samples), the sum of c_k exp(j k w0 t)."""
     return np.asarray(np.fft.rfft(signal, axis=-1) / signal.shape[-1])
 
 
@@ -91,9 +91,7 @@ def _interpolated_noise(valid: Mask) -> float:
 
 
 def interpolated_noise(valid: Mask) -> Array:
-    """Return white noise with a standard deviation of 1 (draws, samples); samples that are not `valid` are
-    interpolated.
-    """
+    """Return white noise of standard deviation 1 (draws, samples), with samples that are not `valid` interpolated."""
     index = np.arange(valid.size)
     drawn = np.random.default_rng(_DRAWS).standard_normal((_DRAWS, valid.size))
     drawn[:, ~valid] = [np.interp(index[~valid], index[valid], row[valid]) for row in drawn]

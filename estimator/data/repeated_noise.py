@@ -36,7 +36,9 @@ _ORDERS = np.arange(1, 30)
 _HEIGHTS = 1.0 / (2.0 * np.pi**2 * _ORDERS**2)
 _HEIGHTS *= ROUNDING / _HEIGHTS.sum()  # the series is truncated
 _REPEATS = _HEIGHTS * np.exp(-((2.0 * np.pi * _ORDERS * _STD[:, None]) ** 2))
-"""Repeating power of each order of the rounding error, for each of `_STD`, without drift (stds, orders) [steps^2]."""
+"""Repeating power of each order of the rounding error, for each value of `_STD`, without drift (stds, orders)
+[steps^2].
+"""
 _SLOW = 1.0 / 16.0  # fraction of the lines that drift may occupy
 _CHANGE = 0.03  # largest relative change in the motion from pass to pass
 _SURE = 3.0  # standard errors by which coloured noise must exceed white noise
@@ -164,8 +166,8 @@ def _power(difference: Array) -> Array:
 def _not_drifted(difference: Array, differs: Array) -> Array:
     """Return the fraction (joints, orders) of each order of the rounding error that repeats despite drift.
 
-    difference: difference of two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,); a fraction of
-    it is noise in the estimated drift, and the effect of this noise is divided out.
+    difference: difference of two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,). A fraction of
+    `differs` is noise in the estimated drift; its effect is divided out.
     """
     filled = _filled(difference)
     closed = without_jump(filled)
@@ -186,7 +188,7 @@ def _repeating(differs: float, kept: Array) -> float:
 
 
 def _filled(difference: Array) -> Array:
-    """Replace missing samples by interpolation between their neighbours; by zero where all are missing."""
+    """Replace missing samples by interpolation between their neighbours; by zero if all are missing."""
     index = np.arange(difference.shape[1])
     filled = np.zeros_like(difference)
     for row, known in zip(filled, difference, strict=True):

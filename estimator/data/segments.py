@@ -110,7 +110,7 @@ def _slice(inside: Mask) -> slice:
 def grid_torque(recording: Recording, grid: Grid, delays: Array, lags: Array) -> Array:
     """Return the mean motor torque over each grid step (joints, steps) [N m].
 
-    delays, lags: those of each joint (joints,) [s].
+    delays, lags: one value per joint (joints,) [s].
     """
     torque = recording.mean_torque(grid.edges, delays)
     return np.stack([_lagging(row, grid.step, float(lag)) for row, lag in zip(torque, lags, strict=True)])

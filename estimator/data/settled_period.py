@@ -53,9 +53,7 @@ class SettledPeriod:
     [rad], if known (`hil.estimator.data.repeated_noise`).
     """
     coloured_noise: Array | None = None
-    """Standard deviation of the non-white part of one sample's error (joints,) [rad], estimated as for
-    `repeated_noise`, if known.
-    """
+    """Standard deviation of the non-white part of a sample's error (joints,) [rad], if known; see `repeated_noise`."""
     stabiliser: Stabilised | None = None
     """The software stabiliser, if one produced part of `torque`.
 
@@ -73,7 +71,7 @@ class SettledPeriod:
     """Standard deviation of one sample's error (joints,) [rad]: coloured noise, combined with the larger of measured
     white noise and rounding noise.
 
-    At a low sampling rate, the highest lines contain motion as well as noise, so what repeats in them from period to
+    At a low sampling rate, the highest lines contain motion as well as noise, so the part that repeats from period to
     period is left out.
     """
 

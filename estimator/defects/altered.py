@@ -93,13 +93,11 @@ class Altered:
 
     @staticmethod
     def sizes(hypothesis: Hypothesis, value: Array) -> Array:
-        """Factors that convert relative changes to SI units (names,): the parameters `value`, or 1 for absolute
-        changes.
-        """
+        """Factors that convert relative changes to SI units (names,): `value`, or 1 for absolute changes."""
         return np.ones_like(value) if hypothesis.is_absolute else value
 
     def fit(self, hypothesis: Hypothesis | None, near: AlteredFit | None = None) -> AlteredFit:
-        """Fit parameters, zeros and the defect. near: fit with another defect, used as a further initial guess. Raises
+        """Fit parameters, zeros and defect. near: fit of another defect, a further initial guess. Raises
         ConvergenceError.
         """
         key = None if hypothesis is None else (hypothesis.kind, hypothesis.joints, hypothesis.course)
@@ -255,9 +253,7 @@ class _Posed:
         return factor
 
     def _scaled_rows(self, number: int, rows: Array, shared: Array) -> tuple[Array, Array]:
-        """Return the residual with scaled angles, and the simulated angles in units of the noise, each (joints,
-        samples).
-        """
+        """Return the residual for scaled angles, and the simulated angles, in units of the noise (joints, samples)."""
         measured = self._altered.measured(number)
         known = np.isfinite(self._altered.problem.segments[number].position)
         angle = np.where(known, rows + measured, 0.0)
@@ -271,7 +267,7 @@ class _Posed:
 
 
 def _with_every_friction(found: ShootingEstimate) -> ShootingEstimate:
-    """Return the estimate with all dry-friction terms, so that no defect imitates them; a new load term is 0."""
+    """Return the estimate with all dry-friction terms, so that no defect imitates one; an added load term is 0."""
     model = replace(found.model, friction=FRICTIONS[-1])
     values = {name: term_of(name).initial for name in model.names} | {
         f"load_{joint}": 0.0 for joint in range(1, model.joints + 1)

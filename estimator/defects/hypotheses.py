@@ -50,7 +50,7 @@ class Hypothesis:
     directions: tuple[Direction, ...]
     """One direction per unknown; empty for angle scales, which have one unknown per joint."""
     strength: Array
-    """Strength of the defect in each segment (segments,), as given by its course."""
+    """Strength of the defect in each segment (segments,), which follows from its course."""
     used: Mask
     """Whether each segment is used (segments,): all but the one in which a sudden change happens."""
 
@@ -116,7 +116,7 @@ def _load(joints: int) -> tuple[Direction, ...]:
 
 
 def _torque_gain(joint: int, values: Mapping[str, float]) -> Direction:
-    """Return the effect of a true torque larger than the column's; for joint 1, all other values appear smaller."""
+    """Return the effect of a torque above the recorded one; if it is joint 1's, all other values appear smaller."""
     if joint > 1:
         return {"torque_scale_2": 1.0}
     less = [name for name in values if term_of(name).unit in TORQUE_UNITS or name == "torque_scale_2"]

@@ -1,4 +1,4 @@
-"""Search for the most probable defect of recordings: score tests of many, then fits of the best few.
+"""Search for the most probable defect of recordings: score tests of many defects, then fits of the best few.
 
 If friction, load or torque changed, or angles have a wrong scale, additional unknowns explain part of the residual. One
 simulation with all derivatives gives the decrease in the sum of squares for each of them (a score test, as in
@@ -41,7 +41,7 @@ class Defect:
 
     @property
     def explained(self) -> float:
-        """Explained fraction of the residual power beyond the noise."""
+        """Fraction of the residual power beyond the noise that the defect explains."""
         return (self.given.left - self.fit.left) / max(self.given.left - 1.0, 1e-6)
 
 
@@ -105,7 +105,7 @@ def _different(scores: Sequence[_Score]) -> list[Hypothesis]:
 
 
 def _neighbours(hypothesis: Hypothesis, every: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return the same sudden change one step earlier and later."""
+    """Return the hypotheses of the same sudden change one step earlier and one step later."""
     alike = [
         each
         for each in every

@@ -1,7 +1,7 @@
 """Smooth minimisation by limited-memory BFGS (Nocedal and Wright, Numerical Optimization, 2nd ed., algorithm 7.5).
 
-It is implemented here because a seed must give the same phases on every machine. With a library's BLAS, it would differ
-by up to 4e-4 of the peak torque (docs/dependencies.md).
+It is implemented here because a seed must give the same phases on every machine. With a library's BLAS, the wave would
+differ by up to 4e-4 of its peak (docs/dependencies.md).
 """
 
 from collections import deque

@@ -3,7 +3,7 @@
 Bytes take wire time (ten bits each). A packet takes effect when its last byte arrives: the plant is advanced to that
 moment with the previous motor currents, then the addressed servos act. Replies start after the servo's return delay and
 reach the host `adapter_latency_us` later. When the host writes, everything up to the last packet of that write is
-computed, even if it lies ahead of the clock. The plant's advance is split at each time between two packets at which a
+computed, even if it lies ahead of the clock. Between two packets, the plant is also advanced to each time at which a
 Bus Watchdog, the servos' own loops or a fault acts.
 
 When host and servo, or two servos with different IDs, transmit at the same time, the later packet and the rest of the
@@ -197,9 +197,7 @@ class FakeBus:
 
     @property
     def next_reply_by(self) -> float:
-        """Time on `clock` at which the next contiguous group of replies will have arrived [s]; infinite if there is
-        none.
-        """
+        """Time on `clock` when the next contiguous group of replies will have arrived [s]; infinite if none is due."""
         return self._wire.next_reply_by
 
     def discard_input(self) -> None:
@@ -210,7 +208,7 @@ class FakeBus:
     # Time
 
     def notice_faults(self) -> None:
-        """Start and end faults that are due by now."""
+        """Start or end the faults that are due by now."""
         now = self.clock.now()
         if now - self._origin >= self.faults.next_change:
             self.advance(now)
@@ -315,7 +313,7 @@ class FakeBus:
             self._instructions.receive(packet, now)
 
     def _receive_with_faults(self, packet: Packet, now: float) -> None:
-        """Receive a packet, subject to faults; a servo affected by a fault also misses packets to all servos."""
+        """Receive a packet, subject to faults; a servo affected by a fault also misses broadcast packets."""
         deaf: set[int] = set()
         for fault in self.faults.on_instructions:
             if not self.faults.strikes(fault, packet.id if fault.servo is None else fault.servo, now - self._origin):

@@ -5,8 +5,9 @@
 Faults can also be given in TOML, as `[[fake.faults]]` with the same keys, and on the command line, as `--fault
 lost_reply:servo=2,at=3`. `FAULTS` describes each kind. Times are seconds since the bus was created (`bus.time`).
 
-Packet faults (replies, instructions, noise) affect each packet with the given probability while they last. Any other
-fault occurs at most once, at the given time, with the given probability. The same seed yields the same faults.
+Packet faults (replies, instructions, noise, another master) affect each packet with the given probability while they
+last. Any other fault occurs at most once, with the given probability, at the given time. The same seed yields the same
+faults.
 """
 
 import difflib

@@ -37,7 +37,7 @@ class Line(Protocol):
     def send(self, replies: Sequence[Reply], now: float) -> None:
         """Put replies on the wire.
 
-        Each starts after its delay from the end of the previous one; the first delay counts from `now`.
+        Each starts with its delay after the end of the previous one; the first delay counts from `now`.
         """
         ...
 
@@ -283,7 +283,7 @@ class Instructions:
         self._line.send(replies, now)
 
     def _append(self, answers: list[Reply], replies: list[Reply]) -> bool:
-        """Append to `replies` what servos with one ID send; return whether the next servo hears one intact reply."""
+        """Append to `replies` what one ID's servos send; return whether the next servo hears one intact reply."""
         pieces = self._overlaid(answers)
         replies += pieces
         return len(pieces) == 1 and pieces[0][2] == answers[0][2]

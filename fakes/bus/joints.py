@@ -23,7 +23,7 @@ class Joints:
         self._servos = tuple(servos)
         self._plant = plant
         self.one_each = self.of == tuple(range(plant.joints))
-        """Whether servo i moves joint i, the usual case."""
+        """Whether servo i moves joint i, as is usually the case."""
 
     def of_joint(self, joint: int) -> list[EmulatedServo]:
         return [servo for servo, moved in zip(self._servos, self.of, strict=True) if moved == joint]

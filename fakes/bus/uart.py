@@ -9,8 +9,8 @@ _STOP = 9  # index of the stop bit among the ten bits of a byte: start, eight da
 def heard(data: bytes, sent_baud: int, heard_baud: int) -> list[tuple[int, float]]:
     """Return the bytes that a receiver at `heard_baud` reads while `data` is sent at `sent_baud` without pauses.
 
-    Each is paired with the time at which it is complete [s after the first start bit]. The receiver samples the middle
-    of each bit and passes on bytes with a wrong stop bit, as USB adapters do.
+    Each byte is paired with the time at which it is complete [s after the first start bit]. The receiver samples the
+    middle of each bit and passes on bytes with a wrong stop bit, as USB adapters do.
     """
     return [(byte, bits / sent_baud) for byte, bits in _received(_line(data), sent_baud / heard_baud)]
 

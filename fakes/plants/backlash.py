@@ -1,7 +1,7 @@
 """An arm with gear backlash: each joint has a rotor and an output shaft, which are in contact at the ends of a gap.
 
-The rotor (with its inertia times the gear ratio squared) is subject to the motor's torque, all friction and the hard
-stops. The links are attached to the output shafts, as are the servos' encoders. Within the gap, no torque is
+The rotor, whose inertia is multiplied by the gear ratio squared, is subject to the motor's torque, all friction and the
+hard stops. The links are attached to the output shafts, as are the servos' encoders. Within the gap, no torque is
 transmitted between the two; at its ends, the gears act as a spring and a damper that can push but not pull.
 
 The contact is stiff: such an arm takes about ten times as long to simulate as one without backlash.

@@ -87,7 +87,7 @@ def make_chain(arm: ChainArm) -> Plant:
 
 
 OWN_PLANTS = frozenset({"hil.fakes.plants.independent:make_plant", "hil.fakes.plants.mujoco_plant:make_plant"})
-"""Factories that a description may name without permission.
+"""Factories that a description may name without special permission.
 
 Only these exact names are allowed, since `getattr` on a module of hil also reaches whatever that module imports.
 """

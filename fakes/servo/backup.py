@@ -1,7 +1,7 @@
 """Factory Reset and Control Table Backup: their effect on a control table.
 
-Source: ROBOTIS e-Manual, protocol2. The contents of a backup are uncertain; here, it holds every writable register
-except ID, Baud Rate, Torque Enable, Bus Watchdog and the goals.
+Source: ROBOTIS e-Manual, protocol2. The contents of a backup are uncertain; here, a backup holds every writable
+register except ID, Baud Rate, Torque Enable, Bus Watchdog and the goals.
 """
 
 from hil.drivers.packet import StatusError

@@ -55,7 +55,7 @@ class Memory:
         return bytes(self.data[address : address + length])
 
     def read_plain(self, address: int, length: int) -> bytes | None:
-        """Like `read`, but also None if the range includes indirect data; faster."""
+        """Like `read`, but faster, and also returns None if the range includes indirect data."""
         if self._points or (address, length) not in self._readable:
             return None if self.is_indirect(address, length) else self.read(address, length)
         return bytes(self.data[address : address + length])

@@ -1,11 +1,11 @@
 """Properties missing from the SDK's control tables: registers' access, factory values and ranges; motor constants.
 
 Source: ROBOTIS e-Manual, pages x/<model> and, for the motors, _data/dxl_x_info.yml and _includes/common/compatible_dxl/
-of its repository ROBOTIS-GIT/emanual (revisions of 2018 to 2024). Differences from some revisions: the range of Min
-Voltage Limit, given there as 110 to 300 with a factory value of 95, is 95 to 160 here as on the sister models. Protocol
-Type only accepts 2, because a fake servo does not support any other. Drive Mode accepts bit 3 (Torque On by Goal
-Update), which is on the page of the XL430-W250 but missing from older revisions of the others. Velocity Limit of the
-XH430-W210 is that of the XD430-T210; its own oldest page states 360.
+of the e-Manual's repository ROBOTIS-GIT/emanual (revisions of 2018 to 2024). Differences from some revisions: the range
+of Min Voltage Limit, given there as 110 to 300 with a factory value of 95, is 95 to 160 here, as on the sister models.
+Protocol Type only accepts 2, because a fake servo does not support any other. Drive Mode accepts bit 3 (Torque On by
+Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the others. Velocity Limit of
+the XH430-W210 is that of the XD430-T210; its own oldest page states 360.
 
 Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
 tens of percent, which is enough to make a position move look right.
@@ -17,12 +17,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 Blocks = tuple[tuple[int, int, int], ...]
-"""Blocks of indirect addressing: addresses of the first address and first data registers, and number of each."""
+"""Blocks of indirect addressing: addresses of the first Indirect Address and Indirect Data, and number of each."""
 
 
 @dataclass(frozen=True, slots=True)
 class RegisterFacts:
-    """Properties of a register missing from control tables. `limits` is None for the full range of its bytes."""
+    """Properties of a register that control tables lack. `limits` is None for the full range of its bytes."""
 
     initial: int = 0
     limits: tuple[int, int] | None = None

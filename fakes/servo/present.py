@@ -173,7 +173,7 @@ class Present:
         return current
 
     def _measure_other(self, now: float, position: float) -> None:
-        """Update Realtime Tick and Present Position (in ticks of an X-series encoder) of a model of another series."""
+        """Update a non-X-series model's Realtime Tick and Present Position (in ticks of an X-series encoder)."""
         register = self._model.registers.get("Present Position")
         if register is not None and register.size == 4:
             self._memory.store(register, round(self.ticks(position)))

@@ -83,9 +83,10 @@ class EmulatedServo(Powered):
         self.has_fast_reads = firmware >= model.fast_read_firmware
         """Whether the servo supports Fast Sync Read, Fast Bulk Read and Control Table Backup."""
         self.connected = True
-        """False if its bus cable is disconnected: it neither receives nor replies; its motor keeps its last command."""
+        """False if the bus cable is disconnected: the servo neither receives nor replies; the motor keeps its command.
+        """
         self.heard_at = 0.0
-        """Time at which it received the last instruction packet [s]; the Bus Watchdog counts from here."""
+        """Time at which it received the last instruction packet [s], from which the Bus Watchdog counts."""
         self.ready_at = 0.0
         """Time at which it has finished booting [s]; it does not respond before then."""
         self.present = Present(
@@ -238,8 +239,8 @@ class EmulatedServo(Powered):
     ) -> tuple[int, bytes]:
         """Execute an instruction addressed to this servo; return the error number and data of the status packet.
 
-        The error number excludes the Alert bit. shadow: the instruction was addressed to the Secondary ID. Read is not
-        included: the bus handles it with `read`, after updating the measurements.
+        The error number excludes the Alert bit. shadow: the instruction was addressed to the Secondary ID. The
+        instruction Read is not handled here: the bus calls `read` after updating the measurements.
         """
         if instruction in (Instruction.WRITE, Instruction.REG_WRITE) and len(body) < 3:
             return StatusError.DATA_LENGTH, b""
@@ -347,7 +348,7 @@ class EmulatedServo(Powered):
         return self.write(body[0] | body[1] << 8, body[2:])
 
     def _clear_turns(self, body: bytes, moving: bool) -> int:
-        """Execute the instruction Clear: shift Present Position, Goal Position and trajectory by the same turns."""
+        """Execute Clear: shift Present Position, Goal Position and trajectory by the same number of turns."""
         before = self.present.ticks(self._angle())
         if error := self.present.clear(body, moving, self._angle()):
             return error

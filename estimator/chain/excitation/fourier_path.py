@@ -94,11 +94,11 @@ def design_path(
     speed: Array,
     seed: int,
 ) -> Path:
-    """Design a path with harmonics up to `highest` [Hz], in which each joint stays within limits.
+    """Design a path with harmonics up to `highest` [Hz] that keeps each joint within limits.
 
     The joints stay within `swing` (joints,) [rad] of `centre` (joints,) [rad] and below `speed` (joints,) [rad/s].
     rate: samples per second; period [s]; prior: rough parameters, whose uncertainty determines which information
-    counts. Raises ExcitationError.
+    matters. Raises ExcitationError.
     """
     count = int(np.floor(highest * period + 1e-9))
     if count < 2 or highest > rate / 8 or min(swing.min(), speed.min()) <= 0.0:
@@ -134,9 +134,7 @@ class Goal:
     """Number of samples of the recording."""
 
     def error(self, lines: NDArray[np.complex128]) -> float:
-        """Return the expected RMS error of the rigid-body torque in other motions, relative to that torque's RMS, for
-        the worst joint.
-        """
+        """Return the expected relative RMS error of the rigid-body torque in other motions, for the worst joint."""
         rows = self._seen(self._columns(self.box.path(lines, self._samples))) * self._lengths
         information = rows.T @ rows
         information[np.diag_indices_from(information)] += 1.0

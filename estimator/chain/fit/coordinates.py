@@ -56,7 +56,7 @@ LONGEST = 2.0  # maximum change of any coordinate in one step
 
 @dataclass(frozen=True)
 class ChainCoordinates:
-    """The map between parameters and coordinates of order 1."""
+    """The map between the parameters and coordinates of magnitude about 1."""
 
     names: tuple[str, ...]
     scales: Array
@@ -125,9 +125,7 @@ class ChainCoordinates:
 
     @cached_property
     def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices, prior means and prior standard deviations of the parameters that have their own prior (friction
-        shapes, drives, small angles).
-        """
+        """Indices, means and standard deviations of the priors on friction shapes, drives and small angles."""
         found = [
             (i, np.log(SHAPES[kind][0]), SHAPES[kind][1]) if kind in SHAPES else (i, 0.0, ANGLES[kind] / SMALL[kind])
             for i, kind in enumerate(self._kinds)

@@ -26,9 +26,9 @@ class HeldZeros:
 
 
 def held_zeros(problem: ChainProblem, x: Array, unfinished: float) -> HeldZeros:
-    """Estimate the encoder zeros that `problem` holds at 0, evaluated at its minimum `x`.
+    """Estimate the encoder zeros that `problem` holds at 0. x: the minimum of `problem`.
 
-    unfinished: expected decrease in the sum of squares in one more step that does not fit the zeros.
+    unfinished: expected decrease in the sum of squares from one more step without fitting the zeros.
     """
     model = replace(problem.model, zeros=True)
     names, size = model.names, len(model.names)

@@ -32,7 +32,7 @@ MOST_KEPT = 1 << 26  # bytes of derivatives
 class _Latest:
     """The latest simulation with derivatives.
 
-    Problems that differ only in weights or prior share it, and the covariance reuses the one at the minimum.
+    It is shared by problems that differ only in weights or prior, and reused for the covariance at the minimum.
     """
 
     x: Array | None = None
@@ -66,8 +66,8 @@ class ChainProblem:
     finer: int = 1
     """Number of smaller integration steps that replace one step in which a joint may be near standstill."""
     every: int = 1
-    """Only every `every`-th sample is compared, with integration steps longer by that factor; it may exceed 1 only if
-    `steps` is 1.
+    """Only every `every`-th sample is compared, and integration steps are longer by this factor, which may exceed 1
+    only if `steps` is 1.
     """
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; smaller near the minimum."""
@@ -76,9 +76,7 @@ class ChainProblem:
     prior still decides what the data do not determine.
     """
     added: tuple[Array | None, ...] = ()
-    """Known base parameters of the mass added to the arm in each period (base parameters,) [SI]; None if none was
-    added.
-    """
+    """Known base parameters of the mass added in each period (base parameters,) [SI]; None if there was none."""
     latest: _Latest = field(repr=False, compare=False, default_factory=_Latest)
 
     @property
@@ -115,7 +113,7 @@ class ChainProblem:
         return np.ascontiguousarray(period.position.T[:: self.every][: period.samples // self.every])
 
     def _thinned(self, of_steps: Array) -> Array:
-        """Average values per step (samples, steps, ...) over groups of `every` samples."""
+        """Average the values for each step (samples, steps, ...) over groups of `every` samples."""
         if self.every > 1:
             whole = of_steps[: len(of_steps) // self.every * self.every]
             of_steps = whole.reshape(-1, self.every, *of_steps.shape[1:]).mean(axis=1)
@@ -132,8 +130,8 @@ class ChainProblem:
         return self._with_prior(x, self._of_data(x))
 
     def tempered(self, x: Array) -> tuple["ChainProblem", Quadratic]:
-        """Return the problem, with the prior's weight raised in proportion to the excess of the residual at `x` over
-        the assumed noise, and the sum of squares at `x`.
+        """Return the problem and the sum of squares at `x`. The prior's weight becomes the mean squared residual at `x`
+        relative to the assumed noise, but at least 1.
 
         Repeated readings have the same reduced weight as in the sum of squares.
         """
@@ -151,7 +149,7 @@ class ChainProblem:
         return max(1.0, sum(float(np.sum(each)) for each in counted))
 
     def _with_prior(self, x: Array, data: Quadratic) -> Quadratic:
-        """Return the sum of squares including the prior's part; infinite if the data's part is."""
+        """Return the sum of squares including the prior's part; infinite if the data's part is infinite."""
         normal, gradient = data.normal.copy(), data.gradient.copy()
         if not np.isfinite(data.cost):
             return Quadratic(np.inf, normal, gradient)
@@ -259,7 +257,7 @@ class ChainProblem:
         return self.steps, self.softness, self.finer, self.every
 
     def scatter(self, x: Array, lags: int) -> Array:
-        """Return the sum of products of the scores, in coordinates; see `hil.estimator.fit.covariance`."""
+        """Return the matrix S of the scores (coordinates, coordinates); see `hil.estimator.fit.covariance`."""
         total = np.zeros((x.size, x.size))
         parameters = self.parameters(x)
         for index, (period, weight) in enumerate(zip(self.periods, self.weights, strict=True)):

@@ -15,13 +15,11 @@ class ChainOptions:
     A softer observer extracts more information; one that is too soft no longer follows the motion.
     """
     lost: float = 1.5
-    """A softer observer is rejected if the cost grows by more than this factor times the growth that its softness
-    explains.
-    """
+    """A softer observer is rejected if the cost grows by more than this factor times the growth due to its softness."""
     first_step: float = 5.2e-3
     """Integration step while the observer is stiff [s]; samples within such a step are skipped."""
     coarse_step: float = 2.6e-3
-    """Integration step of the iterations before the last ones, where first_step does not apply [s]."""
+    """Integration step of the earlier iterations to which `first_step` does not apply [s]."""
     fine_step: float = 1.3e-3
     """Integration step of the last iterations [s]."""
     finer: int = 16
@@ -34,7 +32,7 @@ class ChainOptions:
     initial_width: float = 0.03
     """Initial width of the smoothed Coulomb step [rad/s]."""
     other_initial_widths: tuple[float, ...] = (0.005, 0.001)
-    """Initial widths of further fits, tried as long as no fit explains the motion [rad/s]."""
+    """Initial widths of further fits, which are tried until one explains the motion [rad/s]."""
     poor: float = 1.2
     """RMS weighted residual above which a second initial guess is tried; 1 for noise alone."""
     test_zeros: bool = False
@@ -44,14 +42,14 @@ class ChainOptions:
     reach: float = 0.3
     """Fraction of their maximum change per step that friction-shape parameters may use in the last iterations.
 
-    The sum of squares is far from quadratic in them.
+    The sum of squares is far from quadratic in these parameters.
     """
     ftol_coarse: float = 1e-2
     ftol_near: float = 3e-3
     ftol_nearer: float = 1e-3
     ftol: float = 2e-5
     towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
-    """Initial guesses as fractions of the way from the prior to stage 1's; the first that can be simulated is used."""
+    """Initial guesses, as fractions of the way from the prior to stage 1's result; the first feasible one is used."""
     unfinished: float = 1.0
     """If one more step is expected to decrease the sum of squares by more than this, the minimum has not been reached,
     and the fit continues with shorter integration steps. A decrease of 1 corresponds to a distance of one standard

@@ -56,7 +56,7 @@ class ChainFit:
     missing: Array
     """Estimated distance from `value` to the minimum (parameters,) [SI]."""
     white_covariance: Array
-    """Covariance that `value` would have if the errors of all samples were independent."""
+    """Covariance of `value` if the errors of all samples were independent."""
     starts: tuple[Array, ...]
     """State at the first sample of each period (2, joints) [rad, rad/s]."""
     positions: tuple[Array, ...]
@@ -70,7 +70,7 @@ class ChainFit:
     softness: float
     """Natural frequency of the observer at the end [Hz]."""
     remaining: float
-    """Expected decrease in the sum of squares in one more step, which would reach the minimum."""
+    """Expected decrease in the sum of squares from one more step, which would reach the minimum."""
     neglected: Array
     """Covariance due to effects neglected in the model of voltage-driven joints (parameters, parameters) [SI]."""
     at_bound: tuple[str, ...] = ()
@@ -89,7 +89,7 @@ class ChainFit:
 
     @property
     def reached(self) -> bool:
-        """Whether the fit has reached its minimum: another step would be shorter than one standard error."""
+        """Whether the fit has reached its minimum, so that another step would be shorter than one standard error."""
         return self.remaining <= DEFAULTS.unfinished
 
 

@@ -5,7 +5,7 @@ improves.
 
 If joints often stick, stage 1's estimate of friction can be far off. Softening the observer while the shape of friction
 is fixed then leads the fit into a curved valley. So if the soft observer does not explain the motion, a second fit
-starts from the prior's links, with the shape of friction free as soon as the stiffest observer follows the motion.
+starts from the prior's links, and the shape of friction is fitted as soon as the stiffest observer follows the motion.
 """
 
 import math
@@ -74,9 +74,9 @@ def integration_steps(periods: Sequence[SettledPeriod], longest: float) -> int:
 def repeated(period: SettledPeriod) -> Array:
     """Return the weight of each sample (joints, samples), less than 1 for a sample that shares its neighbours' error.
 
-    While a joint sticks, its encoder repeats one reading with one rounding error. Counted at every sample, that error
-    would make the simulated joint creep towards the reading. Therefore any number of equal readings in a row counts as
-    at most REPEATED readings.
+    While a joint sticks, its encoder repeats one reading with one rounding error. If it counted at every sample, that
+    error would make the simulated joint creep towards the reading. Therefore any number of equal readings in a row
+    counts as at most REPEATED readings.
     """
     weight = np.ones_like(period.position)
     for row, position in zip(weight, period.position, strict=True):
@@ -121,7 +121,7 @@ def _softened_later(coarse: ChainProblem, x: Array, options: ChainOptions) -> tu
 
 
 def resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
-    """Return the problem refined to fit the shape of friction and resolve motion near standstill, its minimum reached
+    """Return the problem refined to fit the shape of friction and resolve motion near standstill, the minimum found
     from `soft`, and the number of simulations used.
     """
     narrowest = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
@@ -157,8 +157,8 @@ def narrowed(problem: ChainProblem, value: Array, starts: Sequence[Array], optio
 
 
 def softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Array, float, int]:
-    """Return the minimum with the softest observer that follows the motion, that observer's softness, and the number of
-    simulations used.
+    """Return a rough minimum with the softest observer that follows the motion, this observer's softness, and the
+    number of simulations used.
 
     Raises ConvergenceError if even the stiffest observer does not follow the motion.
     """
@@ -190,7 +190,7 @@ def softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Arr
 
 
 def _minimised(problem: ChainProblem, x: Array, ftol: float) -> tuple[Minimum, ChainProblem]:
-    """Return the minimum from `x` with the prior weighted according to the residual, and the problem so weighted."""
+    """Weight the prior by the residual at `x`; return the minimum found from there, and the weighted problem."""
     trial, at = problem.tempered(x)
     found = trial.minimise(x, ftol, at=at)
     return replace(found, iterations=found.iterations + 1), trial

@@ -1,14 +1,14 @@
 """Standard errors of a chain's fit, from the noise at the frequencies that determine the parameters.
 
-Rounding errors of a moving joint are not white: they form a fast sawtooth with most of its power above the few hertz of
-the motion, which determine the parameters. The noise at these low frequencies is estimated from the residual. At
-frequency f the fit absorbs the fraction h(f) of the noise, the leverage of its Jacobian, so the power of the residual
-is that of the noise times 1 - h. The noise level of a joint is the mean over frequencies weighted by leverage; for
-model errors, which are slow, it is far above that of white noise. Since short recordings have few degrees of freedom,
-each level is shrunk towards the mean level of all joints, and this mean towards the level of white noise. The level is
-also used for frequencies at which the fit absorbs nearly all noise and the residual reveals none: the observer
-suppresses the slow part of the rounding errors, so their power there is no larger than at higher frequencies. The
-covariance is the sandwich N^-1 S N^-1, where S sums the information of each frequency times the noise there.
+Rounding errors of a moving joint are not white: they form a fast sawtooth with most of its power above the few hertz
+that determine the parameters. The noise at these low frequencies is estimated from the residual. At frequency f the fit
+absorbs the fraction h(f) of the noise, the leverage of its Jacobian, so the power of the residual is that of the noise
+times 1 - h. The noise level of a joint is the mean over frequencies weighted by leverage; for model errors, which are
+slow, it is far above that of white noise. Since short recordings have few degrees of freedom, each level is shrunk
+towards the mean level of all joints, and this mean towards the level of white noise. The level is also used for
+frequencies at which the fit absorbs nearly all noise and the residual reveals none: the observer suppresses the slow
+part of the rounding errors, so their power there is no larger than at higher frequencies. The covariance is the
+sandwich N^-1 S N^-1, where S sums the information of each frequency times the noise there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -69,8 +69,7 @@ class _Spectrum:
 
     joint: int
     lines: NDArray[np.complex128]
-    """Jacobian with respect to scaled coordinates (lines, coordinates), normalised as in a real orthonormal transform.
-    """
+    """Jacobian for scaled coordinates (lines, coordinates), normalised as in a real orthonormal transform."""
     power: Array
     """Power of the residual (lines,); 1 for white noise with the variance that the weights assume."""
     share: Array

@@ -1,6 +1,6 @@
 """Base parameters of a chain: the parameter combinations that torque and motion determine.
 
-The columns of the regressor for random motions are processed one by one, from the base outwards and within a link in
+The columns of the regressor for random motions are processed one by one, from the base outwards and, within a link, in
 the order first moments, inertias, rotor, mass. A column that depends linearly on the previous ones adds no information:
 its parameter is lumped into theirs (Gautier, Journal of Robotic Systems 8 (1991) 485). In this order the sums stay
 short, such as `moment_x_3 + 0.124 mass_4`, since a link's mass acts like a moment of the previous link.
@@ -24,7 +24,7 @@ ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, i
 SAMPLES = 150
 KINDS = (slice(1, 4), slice(4, 10), slice(10, 11), slice(0, 1))  # moments, inertias, armature, mass
 CLEARLY_INDEPENDENT = 0.1
-"""A column is kept at once if the part that the columns kept so far do not explain has a norm above this value.
+"""A column is kept at once if the part of it that the columns kept so far do not explain has a norm above this.
 
 The norm is relative to the largest column of the same link and kind.
 """
@@ -42,7 +42,7 @@ NOTHING = 1e-9
 class BaseParameters:
     """The base parameters of a chain.
 
-    Each is named after the parameter to which it reduces when the others in its group are zero.
+    Each is named after the one parameter of its group to which it reduces when the others are zero.
     """
 
     chain: Chain
@@ -105,7 +105,7 @@ class BaseParameters:
 def _norms_by_kind(norm: Array) -> Array:
     """Return, for each column, the largest norm of the columns of the same link and kind.
 
-    If a kind has hardly any effect in a link, such as the moments of the first link if its axis is vertical up to
+    If a kind has hardly any effect in a link, such as the moments of the first link if its axis is vertical except for
     rounding, the largest norm of all links is used, so that these columns are not scaled up.
     """
     largest = norm.reshape(-1, TERMS).copy()

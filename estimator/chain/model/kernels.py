@@ -8,7 +8,7 @@ over the mass, it is
 
     2 B w = (2 (tr G - G) w_angular, 2 w_angular x l)       G = sum of dm velocity position^T, l the momentum,
 
-so that twelve numbers per body replace its 36. The regressor is that of Atkeson, An and Hollerbach, International
+so that twelve numbers per body replace the 36 of B. The regressor is that of Atkeson, An and Hollerbach, International
 Journal of Robotics Research 5 (1986) 101, in link frames.
 
 Every formula is linear in the inertial parameters, so base parameters, with all others zero, can replace them.
@@ -107,7 +107,7 @@ def place(rotation: Any, translation: Any, axis: Any, q: Any, frame: Any, motion
 
 
 def _carry(link: Any, f: Any, b: Any) -> None:
-    """Transform a link's mass, moment and inertia from its own frame f to the base's origin and directions."""
+    """Transform a link's mass, moment and inertia from its own frame f to the base's origin and axes."""
     m = link[0]
     px, py, pz = f[9], f[10], f[11]
     hx = f[0] * link[1] + f[1] * link[2] + f[2] * link[3]

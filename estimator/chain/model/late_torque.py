@@ -2,8 +2,8 @@
 
 The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
 product of back-EMF and lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due
-to back-EMF. The lag of a winding makes a joint lighter by at most half of its inertia, where the poles of the
-equivalent motor coincide. A greater loss, far from the minimum of a fit, is limited to this value.
+to back-EMF. The lag of a winding cancels at most half of a joint's inertia, namely when the poles of the equivalent
+motor coincide. Far from a fit's minimum, a greater loss is limited to this value.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,9 +18,7 @@ from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 MEANINGS = {"lag_ratio": "ratio of the lag of the joint's current loop to joint 1's"}
 """Meanings of the kinds of parameters specific to chains."""
 PART = 0.1
-"""`limited` names a joint's back-EMF only if the joint contributes more than this fraction to the motion that loses the
-most inertia.
-"""
+"""`limited` names a joint's back-EMF only if its part in the motion that loses the most inertia exceeds this."""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
 _ARMATURE = 10  # of a link's parameters
@@ -87,8 +85,7 @@ inertia [kg m^2] per unit of each parameter that its lagging back-EMF depends on
 
 
 def losses(base: BaseParameters, parameters: Mapping[str, float], names: tuple[str, ...]) -> Losses:
-    """Return the derivatives of the lost inertias with respect to the parameters that cause the loss, for
-    `complete`.
+    """Return, for `complete`, the derivatives of lost inertias with respect to the parameters that cause the loss.
 
     names: the parameters with respect to which to differentiate; the base parameters come first.
     """
@@ -135,7 +132,7 @@ def _generating(joints: int, parameters: Mapping[str, float]) -> list[tuple[int,
 def _possible(
     base: BaseParameters, parameters: Mapping[str, float], generating: Sequence[tuple[int, float, float, float]]
 ) -> float:
-    """Return the factor, at most 1, that limits the inertias lost to lagging back-EMF to what is possible."""
+    """Return the factor, at most 1, that keeps the inertia lost by lagging back-EMF within what is possible."""
     most, _ = _most_lost(base, parameters, generating)
     return min(1.0, MOST_LOST / most) if most > 0.0 else 1.0
 

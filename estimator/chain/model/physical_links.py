@@ -2,7 +2,7 @@
 
 Each link is described by ten log-Cholesky coordinates (Rucker and Wensing, IEEE Robotics and Automation Letters 7
 (2022) 8250): its pseudo-inertia is U U', where U is upper triangular with a positive diagonal, so that every point
-corresponds to a possible mass distribution. Quantities that the base parameters leave open are weakly regularised
+corresponds to a possible mass distribution. Quantities that the base parameters do not determine are weakly regularised
 towards the description.
 """
 

@@ -1,8 +1,8 @@
 """Tilt of the base: gravity in the base's frame as a function of two small angles.
 
 The tilt is a rotation of the base about a horizontal axis, given by the components of its rotation vector along two
-axes that are fixed to the base and perpendicular to the nominal gravity; for an upright base they are its x and y. Two
-angles are all that gravity can reveal.
+axes that are fixed to the base and perpendicular to the nominal gravity; for an upright base, these are its x and y
+axes. Gravity cannot reveal more than two angles.
 """
 
 import numpy as np
@@ -19,9 +19,7 @@ _STEP = 1e-6  # rad, of the differences
 
 
 def tilt_axes(gravity: Array) -> Array:
-    """Return the axes of the two angles (2, 3): the base's x and y, turned by the shortest rotation from -z to
-    gravity.
-    """
+    """Return the axes of the two angles (2, 3): the base's x and y, after the shortest rotation from -z to gravity."""
     down = gravity / np.linalg.norm(gravity)
     x, y, z = down
     if z > 1.0 - 1e-9:  # hanging from a ceiling: half a turn about x
@@ -32,9 +30,7 @@ def tilt_axes(gravity: Array) -> Array:
 
 
 def tilted(gravity: Array, x: float, y: float) -> Array:
-    """Return gravity in the frame of a base that is tilted by these angles; `gravity`: gravity in the frame of the
-    nominal base.
-    """
+    """Return `gravity`, given in the frame of the nominal base, in that of a base tilted by these angles."""
     size = float(np.linalg.norm(gravity))
     if size == 0.0 or (x == 0.0 and y == 0.0):
         return np.array(gravity)

@@ -10,7 +10,7 @@ the largest planned torque for `HOLD_S`; large residuals raise it sooner.
 
 The noise estimate is updated only during motion: the residual of a joint at rest would widen the tolerance until
 nothing exceeded it. A joint at rest is also assessed by the range of torques on it (`hil.estimator.models.standstill`).
-A residual that could lead to an alarm enters the noise estimate only once it has subsided without one.
+A residual that could lead to an alarm enters the noise estimate only once it has subsided without an alarm.
 """
 
 import math
@@ -60,7 +60,7 @@ class ChainObserver:
     covariance: covariance of `mean`.
     largest: largest planned torque of each joint (joints,) [N m].
     interval: sampling interval [s].
-    frictions: `largest` is raised to at least this multiple of dry friction, as far as that is known.
+    frictions: `largest` is raised to at least this multiple of dry friction, where known.
 
     Raises ValueError for arrays of other shapes.
     """

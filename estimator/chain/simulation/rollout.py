@@ -144,7 +144,7 @@ def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = No
 
 
 def _pull_of(loop: Loop) -> tuple[Array, Array, Array]:
-    """Return the path (samples, joints), empty if none; growth per sample and rad (joints,); maximum (joints,)."""
+    """Return the path (samples, joints), possibly empty, growth per sample and rad (joints,), and maximum (joints,)."""
     if loop.pull is None:
         return np.empty((0, len(loop.limit))), np.zeros_like(loop.limit), np.zeros_like(loop.limit)
     return loop.pull.path, loop.pull.per_second / loop.rate * loop.stiffness, loop.pull.share * loop.limit

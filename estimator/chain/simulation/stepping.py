@@ -1,7 +1,7 @@
 """Compiled simulation of a chain under given motor torques, with derivatives.
 
 Friction and drive are modelled as in `hil.estimator.simulation.arm`. Each step uses that module's Rosenbrock method
-ROS2, with the second stage written so that both stages need the regressor at one acceleration only. With f the torques
+ROS2, with the second stage written so that each stage needs the regressor at one acceleration only. With f the torques
 minus friction, S the slopes of friction, ID inverse dynamics, M the mass matrix, and primes for quantities at the end
 of the step as predicted by the first stage,
 
@@ -132,7 +132,7 @@ def _add_four(out: Any, i: int, A: Any, X: Any, j: int, width: int) -> None:
 def _multiply(A: Any, X: Any, inner: int, out: Any) -> None:
     """Set out = A X, with the first `inner` columns of A.
 
-    The number of rows of `out` is even, `inner` a multiple of 4.
+    The number of rows of `out` is even, and `inner` is a multiple of 4.
     """
     rows, width = out.shape
     for i in range(0, rows, 2):
@@ -240,7 +240,7 @@ def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:
 
 
 def _broken(p: Any, v: Any, k: Any, t: Any, solve: Any, step: float, most: int) -> int:
-    """Return the number of smaller steps, at most `most`, that replace an undivided one after its first stage.
+    """Return the number of smaller steps, at most `most`, into which to divide a step after its first stage.
 
     `_pieces` cannot predict that a joint breaks away from standstill. Friction at the end of the stage then differs
     from the tangent that the stage assumed; the velocity error that this difference causes is limited to CROSSED
