@@ -38,7 +38,7 @@ Result = TypeVar("Result")
 
 
 def _guarded(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return `function` with errors due to the values, not to the call, replaced by ConvergenceError."""
+    """Wrap `function` so that an error due to its values, not to a wrong call, becomes a ConvergenceError."""
 
     @wraps(function)
     def guarded(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

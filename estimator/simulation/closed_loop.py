@@ -102,8 +102,8 @@ class Stabilised:
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
-    """Return the physics with the delay added to the lag, minus `command_to_sample` [s]: commands act that much
-    earlier.
+    """Return the physics with the delay, less the `command_to_sample` [s] by which commands act earlier, added to the
+    lag.
     """
     return replace(physics, lag=max(physics.lag + physics.delay - command_to_sample, 1e-5), delay=0.0)
 
