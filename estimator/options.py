@@ -169,7 +169,7 @@ class LikelihoodOptions:
     hopeless_cost: float = 2.0
     """Cost per sample above which a coarse fit is abandoned."""
     refine_ratio: float = 1.01
-    """A candidate with up to this multiple of the best sum of squares may still reach a lower one when refined."""
+    """A candidate with up to this multiple of the best sum of squares may still reach a lower sum when refined."""
     outlier_threshold: float = 4.0
     """Residual in standard deviations above which a sample is downweighted; rounding alone stays below 1.7."""
     threads: int = 8

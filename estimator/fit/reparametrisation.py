@@ -36,8 +36,7 @@ class Coordinates:
     """Scale of each parameter (parameters,) [its unit], from `scales_of`."""
     options: CoordinateOptions
     resolved: Array | None = None
-    """Lower bound of each width, 0 for other parameters (parameters,) [rad/s]: the larger of this and `width_floor`
-    applies.
+    """Lower bound of each width (parameters,) [rad/s], 0 for other parameters; `width_floor` applies if it is larger.
     """
     highest: Array | None = None
     """Upper bounds, from `highest_values` (parameters,) [its unit]; by default none."""

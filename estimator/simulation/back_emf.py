@@ -46,8 +46,8 @@ def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:
 def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Array:
     """Return derivatives (joints, samples, causes) with respect to the parameters `names`, then the remaining causes.
 
-    They are computed from `derivative`, the simulation's derivatives with respect to `causes_of` these names and the
-    same remaining causes. In the simulation viscous friction, back-EMF and the joint's inertia are separate constants.
+    They are computed from `derivative`, the simulation's derivatives with respect to what `causes_of` returns and the
+    same remaining causes. In the simulation, viscous friction, back-EMF and the joint's inertia are separate constants.
     """
     joints = _generating(physics)
     if not joints:

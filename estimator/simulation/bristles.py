@@ -2,9 +2,9 @@
 
     friction = b + damping (1 - b / +-level(v)) v        b' = stiffness v (1 - b / +-level(v))
 
-with the sign of the velocity v and the level of `hil.estimator.simulation.arm`: C. Canudas de Wit, H. Olsson, K. J.
-Astrom and P. Lischinsky, "A new model for control of systems with friction", IEEE Transactions on Automatic Control 40
-(1995) 419. Here b is the bristles' torque. Viscous friction is added as usual.
+with the sign of the velocity v and the level of `hil.estimator.simulation.arm`. Source: C. Canudas de Wit, H. Olsson,
+K. J. Astrom and P. Lischinsky, "A new model for control of systems with friction", IEEE Transactions on Automatic
+Control 40 (1995) 419. Here b is the bristles' torque. Viscous friction is added as usual.
 
 A step of the arm is split (Strang, SIAM Journal on Numerical Analysis 5 (1968) 506). In the first half, the bristles
 deflect at the step's initial velocity (solved exactly); then the arm moves with their torque as an additional offset

@@ -1,6 +1,6 @@
 """Forward sensitivities of an arm with presliding friction.
 
-`hil.estimator.simulation.bristles` splits a step. Here the derivatives of its parts are propagated together with those
+`hil.estimator.simulation.bristles` splits a step. Here the derivatives of the parts are propagated together with those
 of the arm's own step, in which the bristles' torque is an additional offset and their damping additional viscous
 friction.
 """

@@ -42,7 +42,7 @@ def identify(
     start_from: str | PathLike[str] | None = None,
     on_progress: OnProgress = ignore,
 ) -> Identification:
-    """Excite the arm, record a settled period and estimate the arm's parameters: `hil identify` as a function.
+    """Excite the arm, record a settled period and estimate the arm's parameters (`hil identify` as a function).
 
     The arm moves. Torque is off when this function returns or raises.
 
@@ -105,7 +105,7 @@ def record(
     take_over: bool = False,
     on_progress: OnProgress = ignore,
 ) -> Run:
-    """Run the experiment and store its recording for a later estimate: `hil record` as a function.
+    """Run the experiment and store its recording for a later estimate (`hil record` as a function).
 
     The arm moves. Arguments and exceptions are as for `identify`.
     """

@@ -1,7 +1,7 @@
 """Description of an arm whose recording was made elsewhere: the recording's columns, and some properties of the arm.
 
-The TOML file of an experiment can be used, or a shorter one; tables and keys that only an experiment needs are
-ignored, unknown ones are errors.
+The TOML file of an experiment can be used, or a shorter one. Tables and keys that only an experiment needs are
+ignored; unknown ones are errors.
 
     [arm]
     gravity = 9.81

@@ -91,9 +91,7 @@ def _compare_chain(run: RunFolder, config: str, mujoco: bool) -> Comparison:
 
 
 def truth_for(peer: Peer, truth: Mapping[str, float] | None, config: Config) -> Mapping[str, float] | None:
-    """Return the true parameters, scaled to the torque constants that a method's result assumes, as for `hil
-    identify`.
-    """
+    """Return the true parameters, scaled to the torque constants that a method's result assumes."""
     return None if truth is None else in_file_unit(truth, config, peer.parameters, len(config.joints)).values
 
 
