@@ -38,7 +38,7 @@ Result = TypeVar("Result")
 
 
 def _guarded(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Wrap `function` so that an error due to its values, not to a wrong call, becomes a ConvergenceError."""
+    """Wrap `function` so that errors due to the data, not to a wrong call, become ConvergenceErrors."""
 
     @wraps(function)
     def guarded(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

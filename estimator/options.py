@@ -14,7 +14,7 @@ class IntegrationOptions:
     max_step: float = 0.85e-3
     """Longest integration step [s]."""
     max_substeps: int = 64
-    """Maximum number of substeps into which a step is divided when a joint is near standstill."""
+    """Maximum number of substeps into which a step is divided near standstill."""
 
 
 @dataclass(frozen=True)

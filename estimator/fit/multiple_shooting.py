@@ -50,7 +50,7 @@ class ShootingEstimate:
     value: Array
     """Parameter values (parameters,) [SI]."""
     covariance: Array
-    """Covariance (parameters, parameters), robust to model errors: see `Segmented.covariance`."""
+    """Covariance (parameters, parameters), robust to model errors; see `Segmented.covariance`."""
     zeros: Array
     """True minus measured angle for each recording (recordings, joints) [rad]; (0, joints) if not estimated."""
     zeros_std: Array
@@ -119,7 +119,7 @@ class Shooting:
         self._driven: dict[tuple[float, ...], list[tuple[Array, Array]]] = {}
 
     def coordinates(self, base: Mapping[str, float]) -> Coordinates:
-        """Return the parameters' coordinates; `base`: approximate base parameters by name [SI]."""
+        """Return the parameters' coordinates, given approximate base parameters by name [SI]."""
         names, options = self._model.names, self._options
         scales = scales_of(names, Sizes(*self._scales, max(base["inertia_1"], 1e-6)))
         resolved = resolved_widths(names, base, options.max_step, options.coordinates.widths_per_substep)
@@ -303,8 +303,8 @@ def estimate_by_shooting(
         start: initial guess of the base parameters (base parameters,) [SI], such as that of
             `hil.estimator.baselines.idim`.
         length: nominal length of a segment [s].
-        zeros: also estimate the encoders' zero errors, one per joint and recording, for servos whose zero changes at
-            every start. They can only be determined with gravity.
+        zeros: whether to estimate the encoders' zero errors too, one per joint and recording, for servos whose zero
+            changes at every start. They can only be determined with gravity.
         of: which segments of each recording to fit; the others are left for validation.
         near: an estimate from another model or from other segments of the same recordings, used as the only initial
             guess.

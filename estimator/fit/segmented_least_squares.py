@@ -85,7 +85,7 @@ class Segmented:
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.
-        own: number of coordinates, the last ones, that belong to a single recording each.
+        own: number of coordinates at the end that each belong to one recording.
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))

@@ -30,7 +30,7 @@ class LinearEstimate:
     value: Array
     """Parameter values (parameters,) [SI]."""
     std: Array
-    """Standard errors assuming a white residual (parameters,): too optimistic if the friction model is wrong."""
+    """Standard errors assuming a white residual (parameters,); too optimistic if the friction model is wrong."""
     delay: float
     """Delay of the motors' torque [s]."""
     motions: tuple[PeriodicMotion, ...]

@@ -9,7 +9,7 @@ After a first-order low-pass filter both sides become sums over the past (genera
 Mattone, "Sensorless robot collision detection and hybrid force/motion control", ICRA 2005; J.-J. Slotine and W. Li, "On
 the adaptive control of robot manipulators", 1987). The parameters are given as the mean and covariance of an ensemble
 of arms, and are updated with each sample (recursive least squares, that is, a Kalman filter on constants that drift
-slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as it moves.
+slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as the arm moves.
 
 A joint's residual torque is the part that the motion does not account for. An alarm is raised if it exceeds three
 thresholds for `HOLD_S` (a shorter time if it far exceeds them): `TIMES` standard deviations of the uncertainty due to
@@ -17,7 +17,7 @@ parameters and noise, the torque that friction can hold while the joint stands s
 planned torque. The noise is estimated as well, so that effects that the model lacks (Stribeck friction, backlash,
 flexibility) widen the admissible range. A deviation that could lead to an alarm enters this estimate only after it has
 subsided without one. Otherwise, while a joint was held for a long time, the range would widen until nothing exceeded
-it. While a joint stands still, its noise is lower, since most of the noise only arises in motion.
+it. While a joint stands still, its noise is lower, since most noise arises only in motion.
 
 Once a joint's angle has stayed within its gear's play for `_STAYS_S`, the reported velocity does not show in which
 direction friction acts: the motor may stick while the link floats from one side of the play to the other. A torque that
@@ -28,7 +28,7 @@ where presliding of the gear softens every reversal, dry friction looks viscous 
 stopped.
 
 While little is known about an arm, its parameters adapt to a disturbance as if it were a property of the arm. Therefore
-the mean torque over the last few tenths of a second is then also compared with an earlier state of the model
+the mean torque over the last few tenths of a second is also compared with an earlier state of the model
 (`earlier_model`).
 
 Model errors, and the rounding of a velocity that stays below one tick, persist over many updates, so successive updates

@@ -91,7 +91,7 @@ class Physics:
         return late
 
     def crossing_times(self) -> tuple[float, float]:
-        """Return the time [s] in which a reversal of friction crosses each joint's Coulomb step or deflects its
+        """Return the time [s] that a friction reversal takes to cross each joint's Coulomb step or deflect its
         bristles.
         """
         constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))

@@ -23,7 +23,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.compiled import inner
 
 WITHIN_RAD = 0.004
-"""Largest change in the angle of a joint that is at rest [rad]; covers encoder noise and gear play."""
+"""Largest change in the angle of a joint at rest [rad], including encoder noise and gear play."""
 
 AT_REST = 0.95
 """Filtered standstill indicator above which a joint counts as at rest; by then, the filtered deceleration has decayed.

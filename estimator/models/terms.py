@@ -100,7 +100,7 @@ class Term:
     either sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of the two terms whose geometric mean bounds this one; those of the same joint if each joint has this term.
+    """Names of the two terms whose geometric mean bounds this one, both of the same joint if each joint has this term.
     """
     scale: Scale | float = 1.0
     """Typical change in the fit: the name of a scale of the arm and its motion, or a number [unit]."""

@@ -107,7 +107,7 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
 
 @dataclass(frozen=True)
 class TorqueChange:
-    """Constant torque on each joint, acting in the later periods only."""
+    """Constant torque on each joint in the later periods only."""
 
     change: Array
     """Torque (joints,) [N m]."""
@@ -166,7 +166,7 @@ def _fitted(later: "_Later", period: SettledPeriod, most: float | Array) -> tupl
 
 @dataclass(frozen=True)
 class _Later:
-    """The later period as predicted by an estimate; names: parameters that change."""
+    """The later period as predicted by an estimate whose parameters `names` may change."""
 
     estimate: Estimate
     run: Run

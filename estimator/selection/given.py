@@ -2,7 +2,7 @@
 
 The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period if all other effects are modelled
 well. The linear regression cannot represent encoder errors, cables or narrow Stribeck friction. If these matter, the
-search may end at a wrong period. The second search starts from a fit of all other terms.
+search may end at a wrong period. Therefore a second search starts from a fit of all other terms.
 """
 
 from collections.abc import Mapping, Sequence

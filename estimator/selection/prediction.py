@@ -1,4 +1,4 @@
-"""Errors of given parameters in predicting recordings that were not used to estimate them."""
+"""Prediction errors of given parameters on recordings that were not used to estimate them."""
 
 from collections.abc import Mapping, Sequence
 

@@ -23,7 +23,7 @@ FEWEST_ROWS = 3  # minimum number of samples per unknown of the initial state
 
 
 def missing_terms(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[Candidate]:
-    """Return the terms that could be added to the estimate's model, most significant first, by score tests."""
+    """Return the terms that could be added to the estimate's model, most significant first according to score tests."""
     richer = {part: more for part, more in richer_models(estimate.model).items() if part not in NOT_HERE}
     names = {name for more in richer.values() for name in more.names if name not in estimate.names}
     return ranked(linearised(recordings, estimate, sorted(names)), estimate.names, richer, {})

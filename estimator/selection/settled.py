@@ -118,7 +118,7 @@ class Selection:
         return self._fitting.drift
 
     def _begin(self, model: Model, near: Trial | None = None, *, coarse: bool = False) -> None:
-        """If there is an executor, start a fit that may be needed; it becomes a trial only when it is."""
+        """If there is an executor, start a fit in advance; it becomes a trial only when needed."""
         key = (model, id(near), coarse)
         if self._executor is not None and key not in self._begun:
             self._begun[key] = self._executor.submit(self._fitting.trial, model, near, {}, coarse)
@@ -392,7 +392,7 @@ class Selection:
             return None
 
     def _try(self, model: Model, near: Trial | None, values: Mapping[str, float], *, coarse: bool = False) -> Trial:
-        """Fit from the result of `near` with `values` added or replaced or, without `near`, from scratch."""
+        """Fit from scratch or from the result of `near`, in which `values` replace or add parameters."""
         begun = None if values else self._begun.pop((model, id(near), coarse), None)
         trial = self._fitting.trial(model, near, values, coarse) if begun is None else begun.result()
         self.trials.append(trial)

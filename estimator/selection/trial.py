@@ -77,7 +77,7 @@ class Choice:
     def cost(self) -> float:
         """Factor by which the added terms increase the standard errors of the base parameters (geometric mean).
 
-        The reference is the standard errors that would result if the added terms were known exactly.
+        The reference is what the standard errors would be if the added terms were known exactly.
         """
         estimate = self.estimate
         std = estimate.std
@@ -105,7 +105,7 @@ class Fitting:
     """Change in friction from the fitted periods to `held_out`; both are corrected for it."""
 
     def trial(self, model: Model, near: Trial | None, values: Mapping[str, float], coarse: bool) -> Trial:
-        """Fit `model` from the result of `near` with `values` added or replaced or, without `near`, from scratch.
+        """Fit `model` from scratch or from the result of `near`, in which `values` replace or add parameters.
 
         Raises ConvergenceError.
         """

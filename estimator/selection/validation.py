@@ -1,4 +1,4 @@
-"""Checks of an estimate: residual over rounding, whiteness, conditioning, open-loop simulation, Fourier lines."""
+"""Checks of an estimate: residual relative to noise, whiteness, conditioning, open-loop simulation, Fourier lines."""
 
 from dataclasses import dataclass
 

@@ -70,9 +70,9 @@ def simulate(
         physics: physical constants.
         start: state at the first sample (2 or 3, joints): angles [rad], velocities [rad/s] and optionally the torque of
             the bristles [N m], by default as in steady sliding.
-        torque: mean motor torque over each step after each sample (joints, samples, steps) [N m].
+        torque: mean motor torque over each of the steps that follow a sample (joints, samples, steps) [N m].
         step: length of a step [s].
-        max_substeps: maximum number of substeps into which a step is divided when a joint is near standstill.
+        max_substeps: maximum number of substeps into which a step is divided near standstill.
         springs: stiffness of additional springs (joints,) [N m/rad] and the angles to which they pull the joints, held
             between samples (joints, samples) [rad].
 

@@ -116,7 +116,7 @@ def _follow(command: Any, j: int, rate: float, lag: float, lagging: Any) -> None
     """Compute joint j's periodic lagging torque at each command, and its derivative with respect to lag.
 
     The result is written to `lagging` (2, samples). The torque obeys y[k + 1] = a y[k] + (1 - a) u[k]; the steady state
-    follows from its value after one period starting from zero.
+    follows from the value after one period that starts at zero.
     """
     samples = command.shape[1]
     a = math.exp(-1.0 / (rate * lag)) if lag > 0.0 else 0.0

@@ -73,7 +73,7 @@ class ManyArms:
     def peaks(
         self, multisines: Sequence[Commands], rate: float, settling: SettlingRule
     ) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Return the extreme values of each arm, and when it settled.
+        """Return each arm's extreme values, and when it settled.
 
         The values (arms, 5, joints) are lowest and highest angle [rad], speed [rad/s], assumed torque [N m], and
         assumed torque times speed [W]. The second array (arms,) is the number of periods of the first multisine that

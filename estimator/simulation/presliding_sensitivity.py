@@ -49,7 +49,7 @@ from hil.estimator.simulation.sensitivity import (
 
 
 def sensitive(physics: Physics) -> "type[Sensitive]":
-    """Return the class that simulates an arm with these constants, with derivatives."""
+    """Return the class that simulates an arm with these constants, including derivatives."""
     return PreslidingSensitive if has_bristles(physics) else Sensitive
 
 

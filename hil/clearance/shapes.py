@@ -103,7 +103,7 @@ def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule
 class Solid:
     """A primitive of a file's collision geometry, in the frame of its moving link.
 
-    link: 0 for the fixed base. kind: "box", "cylinder", "capsule", "sphere" or "mesh". size: as in MuJoCo: half edge
+    link: 0 for the fixed base. kind: "box", "cylinder", "capsule", "sphere" or "mesh". size: as in MuJoCo, half edge
     lengths, or radius and half length [m]; empty for a mesh. rotation (3, 3), translation (3,) [m]: its pose.
     """
 

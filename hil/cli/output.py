@@ -74,7 +74,7 @@ def bounded_output() -> Iterator[None]:
 
 
 def _bounded(stream: Any, patience: "_Patience") -> Any:
-    """Return a stream to the same terminal or pipe that waits no longer than `patience`; any other stream unchanged."""
+    """Return a stream to the same terminal or pipe that waits at most `patience`; return other streams unchanged."""
     try:
         number = stream.fileno()
         mode = os.fstat(number).st_mode
