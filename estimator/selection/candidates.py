@@ -196,7 +196,7 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
     """Return the estimate's covariance (parameters, parameters) [SI], including the effect of omitted terms that cannot
     be ruled out.
 
-    Changes in the parameters that a fit of these terms, with their prior, would cause also count as errors.
+    A fit of these terms, with their prior, would change the parameters; these changes count as errors too.
     """
     left_out = unruled(estimate.model)
     if not left_out:

@@ -4,9 +4,9 @@ As for settled periods (`hil.estimator.selection.settled`), Stribeck friction is
 the motion, or if score tests find a significant term, all other smooth terms are added at once, with their typical
 sizes as a prior; then insignificant terms are removed.
 
-If the motion is explained down to the noise, the likelihood decides. Otherwise a richer model may merely compensate for
-another missing term. Then every other segment of each recording is fitted and the rest are predicted; models with
-presliding friction are then tried as well.
+If the motion is explained down to the noise, the likelihood decides. Otherwise, since a richer model may merely
+compensate for another missing term, every other segment of each recording is fitted and the rest are predicted; models
+with presliding friction are tried as well.
 """
 
 import time

@@ -170,7 +170,7 @@ def _least(goal: Array) -> Array:
 
 
 def _short_part(goal: Array, measured: Array, margin: float) -> float:
-    """Among the samples with large goals, the fraction whose current is too small."""
+    """Fraction of the samples with large goals whose current is too small."""
     least = _least(goal)
     large = (least > LARGE * np.abs(goal).max()) & np.isfinite(measured[1:])
     if not large.any():
