@@ -28,10 +28,10 @@ class Estimate(FittedParameters):
     """Parameters of the arm estimated from settled periods.
 
     `std` and `covariance` are the uncertainty due to position errors. They are scaled by the actual residual and
-    widened if it is correlated (`hil.estimator.fit.covariance`), so they include the true effect of rounding (a
-    residual of 0.2887 encoder steps RMS is rounding alone). They do not include systematic errors of the torque
-    constant, of the encoder's zero or linearity, or of the model. A residual well above 0.29 steps means that the model
-    is incomplete and that the parameters may be off by more than `std`.
+    widened if it is correlated (`hil.estimator.fit.covariance`), so they include the true effect of rounding (rounding
+    alone leaves a residual of 0.2887 encoder steps RMS). They do not include systematic errors of the torque constant,
+    of the encoder's zero or linearity, or of the model. A residual well above 0.29 steps means that the model is
+    incomplete and that the parameters may be off by more than `std`.
     """
 
     model: Model
@@ -68,14 +68,14 @@ def identify(
     Args:
         periods: one settled period, or several of the same arm, which are fitted together.
         model: the model to fit.
-        coarse: whether to stop early if the residual is well above the noise, which suffices to compare models.
+        coarse: whether to stop early if the residual is well above the noise; this suffices to compare models.
         starts: additional initial guesses, parameters by name [SI], such as those from another experiment or similar
             arms.
-        near: point known to be close to a minimum, used as the only initial guess, which is much faster.
+        near: point known to be close to a minimum, used as the only initial guess; this is much faster.
         options: tolerances and limits of the likelihood.
 
     Returns:
-        Parameters with standard errors, and simulated motion and residual of the first period.
+        The parameters with standard errors, and the simulated motion and residual of the first period.
 
     Raises:
         ModelError: if `model` and a period differ in their number of joints.
@@ -115,7 +115,7 @@ def predict(
     pose: Array | None = None,
     settling: SettlingOptions = SETTLING,
 ) -> Array:
-    """Predict the settled period under another multisine, without using measurements of it.
+    """Predict the settled period under another multisine from its torque alone.
 
     The arm starts at rest and is simulated until its motion repeats.
 

@@ -38,7 +38,7 @@ Result = TypeVar("Result")
 
 
 def _guarded(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return `function` with errors due to the values, not to the call, replaced by ConvergenceError."""
+    """Wrap `function` so that errors due to the data, not to a wrong call, become ConvergenceErrors."""
 
     @wraps(function)
     def guarded(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

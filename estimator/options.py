@@ -14,7 +14,7 @@ class IntegrationOptions:
     max_step: float = 0.85e-3
     """Longest integration step [s]."""
     max_substeps: int = 64
-    """Maximum number of substeps into which a step is divided when a joint is near standstill."""
+    """Maximum number of substeps into which a step is divided near standstill."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class LikelihoodOptions:
     """
 
     ftol: float = 1e-5
-    """Final tolerance; the remaining decrease corresponds to a tenth of a standard error over all parameters."""
+    """Final tolerance: the remaining decrease corresponds to a tenth of a standard error of all parameters together."""
     ftol_refine: float = 3e-4
     """Tolerance for comparing candidate minima."""
     ftol_start: float = 3e-3
@@ -114,13 +114,13 @@ class LikelihoodOptions:
     """Tolerance for fitting the initial state alone."""
 
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=1e-4)
-    """A width at its lower bound of 1e-4 rad/s cannot be distinguished from stiction; a width of 3e-4 rad/s differs
-    from it by half a standard error.
+    """A width at its lower bound of 1e-4 rad/s cannot be distinguished from stiction; one of 3e-4 rad/s differs from
+    stiction by half a standard error.
     """
     minimiser: MinimiserOptions = MinimiserOptions()
     integration: IntegrationOptions = IntegrationOptions()
     coarse_integration: IntegrationOptions = IntegrationOptions(max_step=2.6e-3, max_substeps=16)
-    """Coarse steps: accurate to a few hundredths of an encoder step, in a third of the time of fine ones."""
+    """Coarse steps, accurate to a few hundredths of an encoder step; they take a third of the time of fine ones."""
     covariance: CovarianceOptions = CovarianceOptions()
     least_inflation: float = 2.0
     """Factor by which the data's variance must exceed that of independent errors for priors to gain weight."""
@@ -130,7 +130,7 @@ class LikelihoodOptions:
     initial_widths: tuple[float, ...] = (0.005, 0.05)
     """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried."""
     initial_bends: tuple[float, ...] = (1e-3, 5e-3)
-    """Initial presliding deflection at which the joint begins to slide [rad], one for each of `initial_widths`."""
+    """Initial presliding deflections at which the joint begins to slide [rad], one for each of `initial_widths`."""
     min_initial_lag: float = 1e-4
     """Minimum initial time constant of the current loop [s]."""
     angle_scale: float = 0.1
@@ -146,9 +146,9 @@ class LikelihoodOptions:
     this factor.
     """
     horizons: tuple[float, ...] = (0.125, 0.25, 0.5)
-    """Initial parts of a run to fit, in this order, before the whole run, as fractions of its length."""
+    """Initial parts of a run, as fractions of its length, that are fitted in this order before the whole run."""
     min_horizon_samples: int = 10
-    """Minimum number of samples per unknown, over all joints; a shorter beginning is skipped."""
+    """Minimum number of samples per unknown, over all joints; shorter initial parts are skipped."""
 
     max_relative_decrease: float = 0.8
     """Maximum relative decrease in a Coulomb width per iteration with fine steps, where the cost is nearly quadratic.
@@ -169,7 +169,7 @@ class LikelihoodOptions:
     hopeless_cost: float = 2.0
     """Cost per sample above which a coarse fit is abandoned."""
     refine_ratio: float = 1.01
-    """A candidate with up to this multiple of the best sum of squares may still reach a lower one when refined."""
+    """A candidate with up to this multiple of the best sum of squares may still reach a lower sum when refined."""
     outlier_threshold: float = 4.0
     """Residual in standard deviations above which a sample is downweighted; rounding alone stays below 1.7."""
     threads: int = 8
@@ -188,13 +188,13 @@ class ShootingOptions:
     max_step: float = 1e-3
     """Longest integration step of the last fit [s]."""
     coarse_step: float = 2.6e-3
-    """Longest integration step of the earlier fits [s]: three times as fast as `max_step`, with errors of hundredths of
-    a standard error.
+    """Longest integration step of the earlier fits [s], which are three times as fast as with `max_step`; their errors
+    are hundredths of a standard error.
     """
     start_segments: int = 80
     """Maximum number of segments, evenly spread, in the fits that only need to come close to a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-3)
-    """The lower bound on widths is 3e-3 rad/s: narrower ones are slow to simulate and have no visible effect within a
+    """The lower bound on widths is 3e-3 rad/s: smaller widths are slow to simulate and have no visible effect within a
     second.
     """
     minimiser: SegmentedMinimiserOptions = SegmentedMinimiserOptions()
@@ -214,7 +214,7 @@ class ShootingOptions:
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """Options for the combined likelihood of two periods, without and with a known mass."""
+    """Options for the combined likelihood of two periods, one without and one with a known mass."""
 
     ftol: float = 1e-6
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)
@@ -235,7 +235,7 @@ class SettlingOptions:
 
     max_periods: int = 50
     atol: float = 1e-7
-    """Largest change in the state from one period's end to the next that counts as periodic [rad and rad/s]."""
+    """Motion counts as periodic if a period changes the state by no more than this [rad and rad/s]."""
     acceptable: float = 1e-5
     """Change that is accepted after `max_periods`; far below any encoder step [rad and rad/s]."""
 
@@ -249,12 +249,9 @@ class SelectionOptions:
     explained_residual: float = 1.02
     """RMS residual in units of the noise below which no further term is tried."""
     near_residual: float = 5.0
-    """RMS residual in units of the noise below which a richer model's minimum is searched for near the simpler one's.
-    """
+    """RMS residual in units of the noise below which a richer model's fit starts at the simpler model's minimum."""
     steady_residual: float = 5.0
-    """RMS residual in units of the noise below which a change in friction is searched for, since a worse model may
-    imitate one.
-    """
+    """RMS residual in units of the noise below which friction is checked for changes; a worse model may imitate one."""
     presliding_residual: float = 1.2
     """RMS residual in units of the noise above which a fit with presliding is tried; such fits are slow."""
     initial_widths: tuple[float, ...] = (5e-4, 2e-2)

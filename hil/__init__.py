@@ -76,7 +76,7 @@ logging.getLogger("hil").addHandler(logging.NullHandler())
 def load_model(path: str | PathLike[str]) -> ArmModel:
     """Read the identified arm from a run folder, its result.json, or a TOML or JSON file written by `hil export`.
 
-    Needs numpy only. Raises hil.errors.ResultError, whose message names the file and says whether it is missing,
+    Requires only numpy. Raises hil.errors.ResultError, whose message names the file and says whether it is missing,
     incomplete, damaged, or from a newer version of hil.
     """
     from hil.model_file import read_model

@@ -1,4 +1,4 @@
-"""An identified arm as a model: inverse and forward dynamics, gravity and friction. Needs numpy only.
+"""An identified arm as a model: inverse and forward dynamics, gravity and friction. Requires only numpy.
 
 Equations and names are as in docs/model.md. The last axis of every array runs over the joints; any axes may precede
 it.
@@ -62,7 +62,7 @@ class ArmModel:
         return f"<{type(self).__name__} of {len(self.joints)} joints ({names}), {len(self.values)} parameters>"
 
     def inverse_dynamics(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
-        """Motor torques (..., joints) [N m] for a motion: inertia, Coriolis, gravity, friction, offset, cable, cogging.
+        """Motor torques (..., joints) [N m] for a motion, including those of friction, offset, cable and cogging.
 
         Args:
             q: angles (..., joints) [rad].

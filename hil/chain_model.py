@@ -1,6 +1,6 @@
-"""An identified spatial arm as a model; see `hil.arm_model`. Needs numpy only.
+"""An identified spatial arm as a model; see `hil.arm_model`. Requires only numpy.
 
-Newton-Euler equations in which the base parameters replace the links' own inertial parameters, and all eliminated
+In the Newton-Euler equations, the base parameters replace the links' own inertial parameters, and all eliminated
 parameters are zero.
 """
 

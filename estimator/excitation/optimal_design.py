@@ -182,7 +182,7 @@ class DesignProblem:
 
 @one_blas_thread
 def design_optimal(plain: Multisine, problem: DesignProblem, seed: int) -> Design:
-    """Reduce the standard errors that `problem` defines, starting from `plain` and keeping its lines and period.
+    """Starting from `plain`, whose lines and period are kept, reduce the standard errors that `problem` defines.
 
     The same seed gives the same wave.
     """
@@ -228,7 +228,7 @@ class _Candidate:
         return _Candidate(np.clip(shape, -4.0, 4.0), phases, share)
 
     def wave(self, plain: Multisine) -> Multisine:
-        """Return the multisine of this candidate, with the peaks of the plain one."""
+        """Return this candidate's multisine, scaled to the peaks of `plain`."""
         amplitudes, phases, torque = [], [], np.empty_like(plain.torque)
         for joint, lines in enumerate(plain.lines):
             order = np.log(np.asarray(lines, dtype=np.float64))
@@ -251,7 +251,7 @@ def _times(wave: Multisine, factor: Array) -> Multisine:
 
 
 def _moved(physics: Physics, name: str) -> tuple[Physics, float]:
-    """Return the physics with the constant `name` slightly increased, and the increase."""
+    """Slightly increase the constant `name`; return the changed physics and the increase."""
     if name == "lag":
         change = 1e-5
         return Physics(physics.vector, physics.delay, physics.lag + change), change

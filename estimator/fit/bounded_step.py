@@ -1,4 +1,4 @@
-"""The step that minimises a convex quadratic function within bounds: a primal active-set method.
+"""Primal active-set method for the step that minimises a convex quadratic function within bounds.
 
 The alternative, clipping the unconstrained step and solving again for the coordinates that remain free, would hold some
 coordinates at bounds that are inactive at the constrained minimum. In a narrow valley such a step can even lead uphill

@@ -1,14 +1,14 @@
-"""Standard errors that remain valid if the residual is not white: the sandwich N^-1 S N^-1.
+"""Standard errors, from the sandwich N^-1 S N^-1, that remain valid if the residual is not white.
 
-N = J'WJ is the information, S the scatter of the score J'Wr. For independent errors S = N. Rounding errors of a slow
-joint, and model errors, are correlated between samples. S takes this into account if the products of the score are
-summed over lags (Newey and West, Econometrica 55 (1987) 703). With Bartlett's kernel and L lags, this equals the sum,
-over all windows of L samples, of the outer product of the window's score with itself, divided by L.
+N = J'WJ is the information, and S the scatter of the score J'Wr; for independent errors, S = N. Rounding errors of a
+slow joint, and model errors, are correlated between samples. S allows for this if the products of scores are also
+summed over lags (Newey and West, Econometrica 55 (1987) 703). With Bartlett's kernel and L lags, S equals the sum, over
+all windows of L samples, of the outer product of the window's score with itself, divided by L.
 
-A model error is not only correlated: it repeats at every reversal, so averaging does not remove it, and the part that
-resembles the effect of a parameter leaves no residual at all. Therefore the non-white part of the residual widens the
-errors further: 1.4 standard deviations cover every change in the parameters that alters the motion (RMS) by no more
-than that part (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
+Model errors are not only correlated: they repeat at every reversal, so averaging does not remove them, and any part
+that resembles the effect of a parameter leaves no residual at all. Therefore the non-white part of the residual widens
+the standard errors further: 1.4 of them cover every change in the parameters that alters the motion (RMS) by no more
+than this non-white part (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ VANISHED = 1e-3  # slope relative to its value below which a parameter has run i
 
 
 class Scatter:
-    """Accumulates S from a score (samples, coordinates) given piece by piece; lags: length of the windows [samples]."""
+    """Accumulates S from a score (samples, coordinates), passed piece by piece, over windows of `lags` samples."""
 
     def __init__(self, causes: int, lags: int) -> None:
         self._lags = lags
@@ -57,7 +57,7 @@ class Scatter:
 def correlation_time(residuals: Sequence[Array], options: CovarianceOptions = DEFAULTS) -> int:
     """Return twice the lag [samples] beyond which no residual (joints, samples) of any run is correlated.
 
-    At this lag the autocorrelation first falls into the range expected of white noise.
+    That lag is the first at which the autocorrelation falls into the range expected of white noise.
     """
     longest = options.min_lag
     for residual in residuals:
@@ -102,9 +102,9 @@ def robust_covariance(
     structured: float = 0.0,
     expected: Array | None = None,
 ) -> Array:
-    """Return the covariance of the first `count` coordinates (count, count), with all coordinates unknown.
+    """Return the covariance of the first `count` coordinates (count, count) if all coordinates are unknown.
 
-    It is the larger of the sandwich and the covariance for independent errors, direction by direction, since a short
+    In every direction, it is the larger of the sandwich and the covariance for independent errors, since a short
     recording cannot prove that its errors cancel. It is infinite for a coordinate without influence on the residual.
 
     Args:
@@ -113,7 +113,7 @@ def robust_covariance(
         samples: number of samples.
         count: number of coordinates to return.
         structured: part of the sum of squares that is due to model errors.
-        expected: contribution of a prior to the normal equations (coordinates, coordinates); it keeps its weight where
+        expected: contribution of a prior to the normal equations (coordinates, coordinates); it is not reduced where
             the data's variance is inflated.
     """
     if is_unpredictable(at, samples):
@@ -142,10 +142,10 @@ def is_unpredictable(at: Quadratic, samples: int) -> bool:
 
 
 def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: float, expected: Array) -> Array:
-    """Return the factor (coordinates,) by which each coordinate's variance exceeds that for independent errors.
+    """Return the ratio (coordinates,) of each coordinate's variance to that for independent errors.
 
-    That is the ratio of the variances from the data alone, with and without the contributions that `robust_covariance`
-    adds for correlated errors and model errors. Arguments as in `robust_covariance`.
+    Both variances are from the data alone; the first includes what `robust_covariance` adds for correlated errors and
+    model errors. Arguments as in `robust_covariance`.
     """
     if is_unpredictable(at, samples):
         return np.ones(len(at.normal))
@@ -158,10 +158,10 @@ def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: fl
 def _measured(
     at: Quadratic, scatter: Array | None, samples: int, structured: float, prior: Array
 ) -> tuple[Mask, Array, Array, Array]:
-    """Return two covariances from the data alone: one for independent errors, and a robust one.
+    """Return a mask, a scale, and two covariances from the data alone: one for independent errors, and a robust one.
 
-    The mask, returned first, selects the coordinates that they cover: those that influence the residual. Both are
-    relative to the scale, returned second.
+    The mask selects the coordinates that influence the residual. The covariances cover only these and are relative to
+    the scale.
     """
     norm = np.sqrt(np.diag(at.normal))
     seen: Mask = norm > 1e-12 * norm.max()
@@ -178,10 +178,10 @@ def _measured(
 
 
 def _inverse(information: Array) -> Array:
-    """Return the inverse of a matrix with diagonal elements of at most 1.
+    """Return the inverse of a matrix whose diagonal elements are at most 1.
 
-    Coordinates of which only a combination matters leave an eigenvalue that is zero except for rounding. A
-    pseudoinverse would treat their unknown difference as known exactly.
+    If only a combination of some coordinates matters, an eigenvalue is zero except for rounding. A pseudoinverse would
+    treat their other combinations, which are unknown, as known exactly.
     """
     size, directions = linalg.eigh(information)
     inverse: Array = (directions / np.maximum(size, LEAST_INFORMATION)) @ directions.T
@@ -201,8 +201,8 @@ def larger_covariance(robust: Array, white: Array) -> Array:
 def by_parameters(covariance: Array, slopes: Array, value: Array) -> Array:
     """Return the covariance of the parameters (parameters, parameters) from that of their coordinates.
 
-    A positive parameter without effect on the motion is practically zero: its standard error is its own value. Its
-    coordinate is the logarithm of its distance from the floor, so the slope is that distance.
+    A positive parameter that has run into its floor is practically zero, and its own value serves as its standard
+    error. The slope reveals this: it is the distance from the floor, whose logarithm is the coordinate.
     """
     hidden = np.isinf(np.diag(covariance))
     finite: Array = slopes @ np.where(np.isfinite(covariance), covariance, 0.0) @ slopes.T

@@ -63,8 +63,8 @@ def minimise(
     If the sum alone is much cheaper to compute than its normal equations, pass `cost`: normal equations are then not
     computed for rejected steps, and a step that succeeds is compared with less damped ones.
 
-    Damped steps are short along weakly determined directions and would end the iteration too early there, so near the
-    minimum `damping` should start at `options.min_damping`.
+    Near the minimum, `damping` should start at `options.min_damping`: damped steps are so short along weakly determined
+    directions that the iteration would end too early.
 
     Args:
         evaluate: returns the sum of squares at a point; a non-finite sum counts as too large.
@@ -184,7 +184,7 @@ class _Trials:
 def _step(normal: Array, gradient: Array, damping: float, least: Array, most: Array) -> Array:
     """Return the damped step, with every coordinate's change between `least` and `most`.
 
-    Only the coordinates that reach their limits are held there: if the whole step were scaled, an almost flat
+    Only the coordinates that reach their limits are held there. If the whole step were scaled instead, an almost flat
     coordinate, such as the logarithm of a value near zero, would stop all others.
     """
     scale = np.sqrt(np.diag(normal))

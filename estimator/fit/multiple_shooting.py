@@ -1,9 +1,9 @@
 """Multiple shooting: maximum likelihood on any recording, cut into segments with unknown initial states.
 
 Open-loop simulation accumulates errors: on a long recording, model errors or the chaos of a tumbling arm mask the
-parameters' influence. On a segment of one second they do not. Source: Bock, "Recent advances in parameter
+parameters' influence. On segments of one second, this does not happen. Source: Bock, "Recent advances in parameter
 identification techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical Treatment of Inverse Problems (1983).
-The segments are not joined, since effects that a rigid arm does not have, such as backlash and flexing, may change the
+The segments are not joined, since effects that the rigid model lacks, such as backlash and flexing, may change the
 state between them.
 
 Short segments are fitted first, since they converge even from a poor initial guess. Longer segments then refine the
@@ -50,7 +50,7 @@ class ShootingEstimate:
     value: Array
     """Parameter values (parameters,) [SI]."""
     covariance: Array
-    """Covariance (parameters, parameters), robust to model errors: see `Segmented.covariance`."""
+    """Covariance (parameters, parameters), robust to model errors; see `Segmented.covariance`."""
     zeros: Array
     """True minus measured angle for each recording (recordings, joints) [rad]; (0, joints) if not estimated."""
     zeros_std: Array
@@ -119,7 +119,7 @@ class Shooting:
         self._driven: dict[tuple[float, ...], list[tuple[Array, Array]]] = {}
 
     def coordinates(self, base: Mapping[str, float]) -> Coordinates:
-        """Return the parameters' coordinates; `base`: approximate base parameters by name [SI]."""
+        """Return the parameters' coordinates, given approximate base parameters by name [SI]."""
         names, options = self._model.names, self._options
         scales = scales_of(names, Sizes(*self._scales, max(base["inertia_1"], 1e-6)))
         resolved = resolved_widths(names, base, options.max_step, options.coordinates.widths_per_substep)
@@ -136,8 +136,8 @@ class Shooting:
     def position_by_values(
         self, segment: RecordingSegment, values: Mapping[str, float], offsets: Array, own: Array
     ) -> Array:
-        """Return the simulated positions from the parameters [SI], the `offsets` of the zeros and the segment's own
-        coordinates.
+        """Return the simulated positions for given parameters [SI], `offsets` of the zeros and coordinates of the
+        segment.
         """
         state = own.reshape(2, -1) * self.state_scale
         return self.position(segment, self._with_zeros(values, segment, offsets), state)
@@ -151,8 +151,8 @@ class Shooting:
         return self._rows(number, position)
 
     def derivative(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> tuple[Array, Array]:
-        """Return the residual and its derivatives with respect to the shared coordinates, then the segment's own (rows,
-        all).
+        """Return the residual and its derivatives (rows, all) with respect to the shared and then the segment's own
+        coordinates.
         """
         count = len(coordinates.names)
         values = dict(zip(coordinates.names, coordinates.values(shared[:count]).tolist(), strict=True))
@@ -167,8 +167,8 @@ class Shooting:
     ) -> tuple[Array, Array]:
         """Return the residual at the parameters `values` [SI], and its derivatives (rows, all).
 
-        The derivatives are with respect to the parameters `names`, then the `offsets` of the zeros, then the segment's
-        own coordinates.
+        The columns are the derivatives with respect to the parameters `names`, the `offsets` of the zeros and the
+        segment's own coordinates, in this order.
         """
         segment = self.segments[number]
         physics = self._with_zeros(values, segment, offsets)
@@ -223,7 +223,7 @@ class Shooting:
         self._trust = other._trust
 
     def expected(self, coordinates: Coordinates, shared: Array, own: Array) -> Expected:
-        """Return the prior on small terms, weighted relative to the residual at these coordinates."""
+        """Return the prior on small terms, weighted with the mean square residual at these coordinates."""
         count = len(coordinates.names)
         inertia = float(coordinates.scales[coordinates.names.index("inertia_1")])
         prior = CoordinatePrior.of(coordinates.names, coordinates.scales, Sizes(*self._scales, inertia))
@@ -237,7 +237,7 @@ class Shooting:
         return Expected(centre, weight * precision, weight)
 
     def start(self) -> Array:
-        """Return initial guesses of each segment's own coordinates from its measured positions (segments, 2 joints)."""
+        """Return initial guesses (segments, 2 joints) of each segment's own coordinates from its measured positions."""
         return np.stack([(segment.state / self.state_scale).reshape(-1) for segment in self.segments])
 
     def _zeros_of(self, segment: RecordingSegment) -> slice:
@@ -303,10 +303,11 @@ def estimate_by_shooting(
         start: initial guess of the base parameters (base parameters,) [SI], such as that of
             `hil.estimator.baselines.idim`.
         length: nominal length of a segment [s].
-        zeros: also estimate the encoders' zero errors, one per joint and recording, for servos whose zero changes at
-            every start. They can only be determined with gravity.
+        zeros: whether to estimate the encoders' zero errors too, one per joint and recording, for servos whose zero
+            changes at every start. They can only be determined with gravity.
         of: which segments of each recording to fit; the others are left for validation.
-        near: estimate with another model or other segments of the same recordings, used as the only initial guess.
+        near: an estimate from another model or from other segments of the same recordings, used as the only initial
+            guess.
         options: tolerances.
 
     Raises:
@@ -341,7 +342,7 @@ def estimate_by_shooting(
 def _from_guesses(
     short: Shooting, long: Shooting, coordinates: Coordinates, model: Model, start: Array, options: ShootingOptions
 ) -> Array:
-    """Return shared coordinates near the best minimum, from several guesses: Stribeck friction causes local minima."""
+    """Return the best fit's shared coordinates from several guesses, as Stribeck friction causes local minima."""
     ends: list[Segmented] = []
     lost: list[ConvergenceError] = []
     for x in _initial_guesses(short, coordinates, model, start, options):
@@ -415,7 +416,7 @@ def _samples(segment: RecordingSegment) -> Array:
 def _initial_guesses(
     problem: Shooting, coordinates: Coordinates, model: Model, base: Array, options: ShootingOptions
 ) -> Iterator[Array]:
-    """Yield initial shared coordinates: `base`, completed with guesses for friction."""
+    """Yield initial shared coordinates: `base` and guesses for friction."""
     known = dict(zip(model.base_names, base.tolist(), strict=True))
     known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), options.initial_width)
     for joint in range(1, model.joints + 1):

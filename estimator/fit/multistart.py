@@ -1,8 +1,7 @@
 """Minimisation of the likelihood from several initial guesses, with coarse integration steps first.
 
-Fine steps then decide between minima that coarse ones cannot separate. The noise level of each joint is itself
-estimated before the final iterations, in which outliers are downweighted (Huber), so that a few corrupted readings do
-no harm.
+Fine steps then decide between minima that coarse ones cannot separate. Each joint's noise level is estimated before the
+final iterations, which downweight outliers (Huber) so that a few corrupted readings do no harm.
 """
 
 from collections.abc import Callable, Sequence
@@ -59,8 +58,7 @@ class Search:
     """The objective with coarse integration steps."""
     options: LikelihoodOptions
     coarse: bool
-    """Whether to stop before full convergence if the residual is well above the noise, which suffices to compare
-    models.
+    """Whether to stop before full convergence if the residual is well above the noise; this suffices to compare models.
     """
 
     @property
@@ -69,7 +67,8 @@ class Search:
         return int(sum(period.valid.sum() for period in self.periods))
 
     def minimum(self, guesses: Sequence[Array], springs: Array) -> tuple[Refined, Minimum]:
-        """Return the best minimum from `guesses`, each (coordinates,), the last of which has a wide Coulomb step.
+        """Return the best minimum reached from `guesses`, each (coordinates,). The last guess must have a wide Coulomb
+        step.
 
         springs: tracking stiffness (joints,) [N m/rad]. Raises ConvergenceError.
         """
@@ -88,7 +87,7 @@ class Search:
         return self._undisguised(refined, replace(minimum, iterations=spent))
 
     def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
-        """Return the minimum with constant Stribeck rises replaced by Coulomb friction, unless it explains less."""
+        """Replace constant Stribeck rises by Coulomb friction, unless the fit becomes significantly worse."""
         if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
             return refined, minimum
         try:
@@ -130,7 +129,7 @@ class Search:
         return starts
 
     def _from_guess(self, x: Array, springs: Array) -> Start:
-        """Fit the open-loop motion from a guess, after a fit in which springs keep it close to the measured motion."""
+        """From a guess, fit the motion first with springs that hold it close to the measured one, then in open loop."""
         options, rough = self.options, self.rough
         ftol = options.ftol_coarse if self.coarse else options.ftol_start
         tracking = replace(rough, tracking_stiffness=springs).minimise(x, options.ftol_coarse)
@@ -154,11 +153,11 @@ class Search:
         return Start(tracking.x, replace(_best(ends), iterations=spent))
 
     def _refine(self, starts: Sequence[Start], wide: Array) -> Refined:
-        """Refine the best of `starts`, and variants with different friction near standstill, using fine steps.
+        """Using fine steps, refine the best of `starts` and variants of it with different friction near standstill.
 
-        A fit that explains the motion may still have the wrong friction near standstill. The tracking fit determines it
-        well, and fits do not progress from a narrow step to a wide one, so the friction of the tracking fit and that of
-        `wide` (coordinates) are both tried.
+        A fit that explains the motion may still have the wrong friction near standstill. The tracking fit determines
+        this friction well, but no fit gets from a narrow Coulomb step to a wide one. Therefore both the friction of the
+        tracking fit and that of `wide` (coordinates) are tried.
         """
         options = self.options
         ftol = options.ftol_coarse if self.coarse else options.ftol_start
@@ -198,7 +197,7 @@ class Search:
         return replace(near, iterations=found.iterations + near.iterations)
 
     def _compare(self, tries: Sequence[Minimum], ftol: float) -> Refined:
-        """Fit `tries` with fine steps and samples weighted by the residual of the best; return the best fit."""
+        """Refit `tries` with fine steps, weighting samples by the residual of the best of them; return the best fit."""
         positions = self.fine.positions(_best(tries).x)
         weights, outliers = noise_weights(self.periods, positions, self.options.outlier_threshold)
         weighted = replace(self.fine, weights=weights)

@@ -1,4 +1,4 @@
-"""Weights of position samples from the residuals of a fit: noise level per joint, outliers downweighted (Huber)."""
+"""Weights of position samples from each joint's noise level in a fit; outliers are downweighted (Huber)."""
 
 from collections.abc import Sequence
 

@@ -1,7 +1,7 @@
 """Compiled products for least squares, without BLAS or a weighted copy of the Jacobian.
 
-They are as fast as BLAS with one thread. With several threads, BLAS is ten times slower for products of this size on a
-busy machine, and the last digits of a fit would depend on the number of threads (docs/dependencies.md).
+They are as fast as BLAS with one thread. With several threads, BLAS would be ten times slower for products of this size
+on a busy machine, and the last digits of a fit would depend on the number of threads (docs/dependencies.md).
 """
 
 from collections.abc import Callable

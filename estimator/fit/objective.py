@@ -1,4 +1,4 @@
-"""The likelihood's objective: weighted squared residuals of several runs, measured minus simulated position."""
+"""The likelihood's objective: the weighted sum of squares of measured minus simulated position over several runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +37,7 @@ class Objective:
     max_relative_decrease: float
     """Maximum relative decrease in the width of a smoothed Coulomb step per iteration."""
     horizon: float = 1.0
-    """Fraction of each run, from its beginning, that is used."""
+    """Fraction of each run that is used, starting at its beginning."""
     tracking_stiffness: Array | None = None
     """Stiffness of springs that pull the simulated arm to the measured angles (joints,) [N m/rad]."""
     fixed_parameters: bool = False

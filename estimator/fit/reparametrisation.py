@@ -2,8 +2,8 @@
 
 The range, scale and longest step of each parameter are declared in `hil.estimator.models.terms`. Positive parameters
 are exponentials of their coordinates. Coupling is a fraction of its bound: sqrt(inertia_1 inertia_2) tanh(z), where z
-is its coordinate. This keeps the mass matrix positive definite. Likewise, the asymmetry of viscous friction is viscous
-tanh(z), which keeps friction positive in both directions.
+is its coordinate. This keeps the mass matrix positive definite. Likewise, viscous_asymmetry = viscous tanh(z), which
+keeps friction positive in both directions.
 """
 
 from dataclasses import dataclass
@@ -36,8 +36,7 @@ class Coordinates:
     """Scale of each parameter (parameters,) [its unit], from `scales_of`."""
     options: CoordinateOptions
     resolved: Array | None = None
-    """Lower bound of each width, 0 for other parameters (parameters,) [rad/s]: the larger of this and `width_floor`
-    applies.
+    """Lower bound of each width (parameters,) [rad/s], 0 for other parameters; `width_floor` applies if it is larger.
     """
     highest: Array | None = None
     """Upper bounds, from `highest_values` (parameters,) [its unit]; by default none."""
@@ -64,7 +63,7 @@ class Coordinates:
         """Return the point that `step` (coordinates,) reaches from `x`; both arrays may end with other coordinates.
 
         A step changes a width itself rather than its logarithm, since the motion depends linearly on the width. With
-        exponential steps it would never reach its floor.
+        exponential steps, a width would never reach its floor.
         """
         y = x + step
         widths = np.flatnonzero(self._floors)
@@ -75,8 +74,8 @@ class Coordinates:
     def moved_in_proportion(self, x: Array, step: Array) -> Array:
         """Return the point that `step` (coordinates,) reaches from `x`; both arrays may end with other coordinates.
 
-        Base parameters change linearly with the step, not exponentially: valleys along which only a sum of inertias is
-        determined are then straight.
+        Base parameters change linearly with the step, not exponentially. This straightens valleys along which only a
+        sum of inertias is determined.
         """
         y, count = x + step, len(self.names)
         for index, term in enumerate(map(term_of, self.names)):
@@ -92,8 +91,9 @@ class Coordinates:
     def limit(self, x: Array, least: Array, most: Array, max_relative_decrease: float) -> None:
         """Tighten, in place, the bounds on the change of each coordinate in one step from `x` (coordinates,).
 
-        A width is limited relative to itself, other parameters by their `Term.max_step`. If a width reached its floor,
-        on which the motion hardly depends, no later step would increase it again.
+        The change in a width is limited relative to the width, that in other parameters by their `Term.max_step`. A
+        width that reached its floor, where it hardly affects the motion, would not be increased again by any later
+        step.
         """
         least[: x.size] = np.maximum(least[: x.size], -self._longest)
         most[: x.size] = np.minimum(most[: x.size], self._longest)
@@ -137,7 +137,7 @@ class Coordinates:
         """Return the lower and upper bounds (parameters,) of the parameters `value` (parameters,).
 
         Widths have no bounds: a Coulomb step narrower than its lower limit has the same effect as a sharp one. The
-        bounds `highest` are not physical either.
+        bounds `highest` are left out too, since they are not physical.
         """
         positive = np.array([term_of(name).range == "positive" for name in self.names])
         lower, upper = np.where(positive, 0.0, -np.inf), np.full(value.size, np.inf)
@@ -166,7 +166,7 @@ class Coordinates:
 
     @cached_property
     def _shares(self) -> list[tuple[int, int, int]]:
-        """Index triples: a parameter bounded by the geometric mean of two others, and those two."""
+        """Index triples: a parameter, and the two others whose geometric mean bounds it."""
         shares = []
         for share, name in enumerate(self.names):
             bounds, joint = term_of(name).share_of, joint_of(name)

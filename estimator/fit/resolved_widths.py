@@ -1,7 +1,7 @@
 """The narrowest smoothed Coulomb step that a simulation resolves.
 
-On a light arm, friction stops a joint within microseconds. A step narrower than these bounds looks no different in any
-recording, but the simulation jumps back and forth across it, which makes the derivatives meaningless.
+On a light arm, friction stops a joint within microseconds. A narrower step looks no different in any recording, but the
+simulation jumps back and forth across it, which makes the derivatives meaningless.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,7 @@
 """Period of torque ripple and cogging over the joint angle: a scan that needs no initial guess.
 
-For each number of cycles per turn, torque times the sine and cosine of the angle are two additional columns of the
-regression on Fourier lines; for cogging, the columns are the sine and cosine themselves. The best number is the
+For each number of cycles per turn, the regression on Fourier lines gets two more columns: torque times the sine and the
+cosine of that multiple of the angle or, for cogging, the sine and the cosine themselves. The best number is the
 likelihood's initial guess.
 """
 
@@ -29,7 +29,7 @@ STRIBECK_VELOCITY = 0.15  # rad/s: a rough value suffices to separate the Stribe
 
 
 def find_waves(periods: Sequence[SettledPeriod], linear: LinearEstimate, wave: Wave) -> dict[str, float]:
-    """Return cycles per turn, sine and cosine parts of each joint's ripple [1] or cogging [N m], by parameter name."""
+    """Return cycles per turn and sine and cosine parts of each joint's ripple [1] or cogging [N m], by parameter."""
     found: dict[str, float] = {}
     for joint in range(periods[0].joints):
         each = [
@@ -61,7 +61,7 @@ def _parts(each: list[tuple[Array, Array, Array, Array]]) -> list[tuple[Array, i
 def _prepared(
     period: SettledPeriod, motion: PeriodicMotion, harmonics: int, joint: int, delay: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return a joint's columns and torque on the lines, as real numbers, and torque and angle over time (samples,)."""
+    """Return a joint's columns and torque on the lines as real numbers; its torque and angle over time (samples,)."""
     Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)[joint]
     velocity = motion.velocity[joint]
     sign = np.tanh(velocity / COULOMB_WIDTH)

@@ -21,8 +21,8 @@ Residual = Callable[[int, Array, Array], Array]
 """Returns the residuals (rows,) of one segment at the shared coordinates (shared,) and its own (own,)."""
 
 Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
-"""Returns the residuals of one segment as `Residual` does, and their derivatives with respect to the shared
-coordinates, then its own (rows, shared + own).
+"""Returns the residuals of one segment as `Residual` does, and their derivatives with respect to the shared and then
+the segment's own coordinates (rows, shared + own).
 """
 
 DEFAULTS = SegmentedMinimiserOptions()
@@ -70,22 +70,22 @@ class Segmented:
     variance: float
     """Sum of squares per degree of freedom."""
     expected: Expected | None = None
-    """The prior's contribution to `information` (shared, shared)."""
+    """The prior that `information` includes; None without a prior."""
 
     def covariance(self, groups: npt.NDArray[np.int64] | None = None, own: int = 0) -> Array:
         """Return the sandwich covariance of the shared coordinates (shared, shared), treating segments as independent.
 
-        It is valid if residuals within a segment are correlated, as model errors are: Liang and Zeger, "Longitudinal
-        data analysis using generalized linear models", Biometrika 73 (1986) 13. With fewer segments than MIN_SEGMENTS
-        times the number of coordinates, correlations cannot be estimated; then a single factor scales the covariance
-        for white noise. The covariance is infinite for coordinates that can change, alone or together, without
-        affecting the residual.
+        It remains valid if residuals within a segment are correlated, as model errors are (Liang and Zeger,
+        "Longitudinal data analysis using generalized linear models", Biometrika 73 (1986) 13). With fewer segments than
+        MIN_SEGMENTS times the number of coordinates, correlations cannot be estimated; the covariance for white noise,
+        times a single factor, is then returned. The covariance is infinite for coordinates that can change, alone or
+        together, without affecting the residual.
 
-        No variance is less than for white residuals.
+        Every variance is at least as large as for white residuals.
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.
-        own: number of coordinates, at the end, that each belong to a single recording.
+        own: number of coordinates at the end that each belong to one recording.
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
@@ -143,8 +143,8 @@ class _Blocks:
     """J'r of the own coordinates (segments, own)."""
 
     def reduced(self, damping: float) -> tuple[Array, Array, Array, Array]:
-        """Return information and scores with own coordinates eliminated, and two terms for recovering those
-        coordinates.
+        """Return information and scores with the segments' own coordinates eliminated, and two terms for recovering
+        these.
         """
         eye = np.eye(self.own.shape[1])
         scale = np.diagonal(self.own, axis1=1, axis2=2).max(axis=1)[:, None, None] * 1e-14
@@ -168,7 +168,7 @@ def minimise_segmented(
 ) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
-    `residual` and `derivative` are called from several threads, whose number does not change the result.
+    `residual` and `derivative` are called from several threads; their number does not affect the result.
 
     Args:
         residual: returns the residuals of a segment.
@@ -178,7 +178,7 @@ def minimise_segmented(
         ftol: stop when the relative decrease in one step is below this.
         options: limits of the iteration.
         expected: prior on the shared coordinates.
-        move: returns the shared coordinates reached by a step from given ones.
+        move: applies a step to the shared coordinates.
 
     Raises:
         ConvergenceError: if the simulation diverges, or if the relative decrease still exceeds `options.unfinished`

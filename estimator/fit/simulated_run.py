@@ -80,8 +80,8 @@ class SimulatedRun:
     ) -> Iterator[tuple[slice, Array, Array]]:
         """Simulate the run piece by piece, with derivatives.
 
-        Yields the samples of each piece, their angles (joints, samples) [rad], and the derivatives of these angles with
-        respect to `names`, then the initial state (joints, samples, causes).
+        Yields the samples of each piece, their angles (joints, samples) [rad], and the derivatives (joints, samples,
+        causes) of these angles with respect to `names` and then the initial state.
 
         Args:
             physics: physical constants.

@@ -6,8 +6,8 @@ A stabiliser with stiffness k applied the torque k (pose - measured). In closed 
 simulation therefore uses the commanded torque and this spring instead of the loop. An arm that is unstable on its own
 then stays close to the real one. The damper, which only determines how fast deviations decay, is left out.
 
-The springs pull the simulated joints to where the real ones were. Therefore any encoder errors in the model are removed
-from the measured angles.
+The springs pull the simulated joints to where the real ones were. Therefore the measured angles are first corrected for
+any encoder errors in the model.
 """
 
 from collections.abc import Iterator

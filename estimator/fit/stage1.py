@@ -1,4 +1,4 @@
-"""Stage 1: linear least squares on the Fourier lines of settled periods; no initial guess, no local minima.
+"""Stage 1: linear least squares on the Fourier lines of settled periods, without initial guesses or local minima.
 
 The motion's lines above the noise are differentiated exactly, the regressor is evaluated on the resulting motion, and
 regressor and torque are compared line by line. The command's derivative is one more column, whose coefficient is the
@@ -30,7 +30,7 @@ class LinearEstimate:
     value: Array
     """Parameter values (parameters,) [SI]."""
     std: Array
-    """Standard errors assuming a white residual (parameters,): too optimistic if the friction model is wrong."""
+    """Standard errors assuming a white residual (parameters,); too optimistic if the friction model is wrong."""
     delay: float
     """Delay of the motors' torque [s]."""
     motions: tuple[PeriodicMotion, ...]
@@ -47,8 +47,8 @@ class LinearEstimate:
 def fit_lines(*periods: SettledPeriod, options: LinearOptions = DEFAULTS) -> LinearEstimate:
     """Estimate the base parameters from one or more settled periods of one arm.
 
-    Raises UnidentifiableError if the motion does not separate them, ShapeError if the periods differ in their number of
-    joints.
+    Raises UnidentifiableError if the motion does not separate them, or ShapeError if the periods differ in their number
+    of joints.
     """
     joints = periods[0].joints
     if any(period.joints != joints for period in periods):

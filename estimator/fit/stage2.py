@@ -1,4 +1,4 @@
-"""Stage 2: maximum likelihood, by least squares of measured minus simulated position over settled periods.
+"""Stage 2: maximum likelihood, that is, least squares of measured minus simulated position over settled periods.
 
 If position errors are independent and identically distributed, as rounding errors nearly are, the most likely
 parameters minimise the weighted sum of squares. The initial state of each run is estimated as well: simulating until
@@ -37,7 +37,7 @@ from hil.estimator.simulation.back_emf import limited
 
 DEFAULTS = LikelihoodOptions()
 HARDLY = 0.05
-"""Fraction of a term's usual initial guess with which to start near the minimum of a model without the term."""
+"""A term added to a model starts, near that model's minimum, at this fraction of its usual initial guess."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def fit_runs(
         periods: settled periods of one arm.
         model: the model to fit.
         linear: stage 1's estimate for the same periods.
-        coarse: whether to stop early if the residual is well above the noise, which suffices to compare models.
+        coarse: whether to stop early if the residual is well above the noise; this suffices to compare models.
         starts: additional initial guesses, parameters by name [SI], tried before all others.
         near: point known to be close to a minimum, used as the only initial guess.
         options: tolerances and limits.
@@ -295,8 +295,8 @@ def _fit(
 
 
 def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Array) -> tuple[str, ...]:
-    """Return the parameters that lie at a bound although the data favour values beyond it, if base parameters depend on
-    them.
+    """Return the parameters that lie at a bound although the data favour values beyond it, provided that this affects
+    base parameters.
 
     std: standard errors of the parameters `value` (parameters,).
     """
@@ -314,9 +314,9 @@ def _tempered(
 ) -> Minimum:
     """Return the minimum with priors reweighted by the data's actual information; `minimum` if nothing changes.
 
-    The sum of squares treats the errors of all samples as independent. A model error repeats at every reversal, so the
-    data constrain a parameter far less than this implies, and the fit would override any prior. Therefore each prior's
-    precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
+    The sum of squares treats the errors of all samples as independent, but a model error repeats at every reversal. The
+    data therefore constrain a parameter far less than the sum implies, and the fit would override any prior. To prevent
+    this, each prior's precision is multiplied by the ratio of the data's variance to that of independent errors.
     """
     count, prior = objective.count, objective.prior
     if objective.lever is None and not prior.precision.any():
@@ -336,9 +336,9 @@ def _tempered(
 
 
 def _model_error(residual: Array, weight: Array, period: SettledPeriod) -> Array:
-    """Return the part of each joint's weighted sum of squares that is neither white nor noise (joints,).
+    """Return the part of each joint's weighted sum of squares that is due to model errors (joints,).
 
-    Rounding errors of a slow joint are not white either, so a residual no larger than the noise is not a model error.
+    This is the part that is not white, but at most what exceeds the noise: a slow joint's rounding is not white either.
     """
     squares = np.sum(residual**2, axis=1)
     noise = np.sum((weight * period.noise[:, None]) ** 2, axis=1)

@@ -1,9 +1,9 @@
 """Parameters at a bound of their range, although the data favour values beyond it.
 
-A fit cannot leave the physical range. If the best value lies outside, the fit stops at the bound, which the standard
-errors do not reflect, and the other parameters absorb the difference. A parameter whose true value is zero, such as the
-Stribeck term of a joint without Stribeck friction, also ends there but does no harm: the undamped step of the normal
-equations, in the parameters themselves, distinguishes the two cases.
+A fit cannot leave the physical range. If the best value lies outside, the fit stops at the bound, the other parameters
+absorb the difference, and the standard errors do not show this. A parameter whose true value is zero, such as the
+Stribeck term of a joint without Stribeck friction, also ends at its bound but does no harm. The undamped step of the
+normal equations, expressed in the parameters themselves, distinguishes the two cases.
 """
 
 from collections.abc import Sequence
@@ -21,11 +21,11 @@ MOVED = 1.0  # standard errors by which the bound must shift another parameter f
 
 
 def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, Array]:
-    """Return the undamped step of the parameters (parameters,) [SI], ignoring their range, and its standard errors.
+    """Return the undamped step of the parameters (parameters,) [SI] without bounds, and its standard errors.
 
-    The standard errors are those of independent errors with variance 1. normal, gradient: normal matrix and gradient of
-    the sum of squares in coordinates (coordinates, coordinates) and (coordinates,). slopes: derivatives of the
-    parameters with respect to the first coordinates, their own (parameters, parameters).
+    The standard errors are those for independent errors with variance 1. normal (coordinates, coordinates), gradient
+    (coordinates,): normal matrix and gradient of the sum of squares. slopes: derivatives of the parameters with respect
+    to their coordinates, which are the first ones (parameters, parameters).
     """
     # Each coordinate by its own scale: that of a parameter that has run to zero is many orders of magnitude smaller.
     scale = np.sqrt(np.diag(normal))
@@ -42,8 +42,8 @@ def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Arr
     """Return which parameters (parameters,) lie at a bound, `lower` or `upper`, although the data favour values beyond
     it.
 
-    std: standard errors for independent errors. Standard errors widened for the misfit would hide such a parameter if
-    its bound itself causes the misfit.
+    std: standard errors for independent errors. If they were widened for the misfit, a parameter whose bound causes the
+    misfit would go unnoticed.
     """
     best, near = value + step, NEAR * np.abs(step)
     below: Mask = (best < lower - SURE * std) & (value - lower <= near)
@@ -52,11 +52,10 @@ def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Arr
 
 
 def finite_std(std: Array, white: Array) -> Array:
-    """Return the standard errors `std` (parameters,), with infinite ones, such as those at a bound, replaced by finite
-    ones.
+    """Return the standard errors `std` (parameters,) with infinite ones, as at a bound, replaced by finite ones.
 
-    white: standard errors for independent errors. They replace infinite ones, widened by the same factor as those of
-    the other parameters.
+    white: standard errors for independent errors. They replace infinite ones after being widened by the median factor
+    of the other parameters.
     """
     known = np.isfinite(std) & (white > 0.0)
     wider = float(np.median(std[known] / white[known])) if known.any() else 1.0

@@ -127,8 +127,8 @@ def contradicted(found: Sequence[Conflict], explained: bool) -> str:
     """Return the most favourable verdict that the contradictions allow: "no", "with care", or "" if they allow any
     verdict.
 
-    explained: whether the model explains the motion. If it does not, a missing effect has distorted the value, and
-    presumably all others as well.
+    explained: whether the model explains the motion. If it does not, a missing effect has distorted the contradictory
+    value, and presumably all others as well.
     """
     of_file = [each for each in found if each.source == "file"]
     if of_file:

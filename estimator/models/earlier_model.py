@@ -1,10 +1,10 @@
-"""Comparison of the mean torque over the last few tenths of a second with the model from before that time.
+"""Comparison of the mean torque over the last few tenths of a second with the model as it was before that time.
 
-A push or grip that begins while the model is still being learnt distorts it, so that no residual stands out. The
-earlier model is unaffected. Its prediction for all samples since then is therefore compared with the mean torque over
-that time: over the last 5, 10 and 20 lessons (updates of the model), which last 0.1, 0.2 and 0.4 s. Averaging cancels
-effects that alternate with the motion (noise, play, ripple), but not a push. If the joint has hardly moved in that
-time, the static friction that may have held it is subtracted.
+If someone pushes or grips the arm while the model is still being learnt, the model adapts to this, and no residual
+stands out. A model stored earlier is unaffected. Therefore its prediction is compared with the mean torque since it was
+stored, 5, 10 and 20 lessons (updates of the model) or 0.1, 0.2 and 0.4 s ago. Averaging cancels effects that alternate
+with the motion (noise, play, ripple), but not a push. If the joint has hardly moved since, the static friction that may
+have held it is subtracted.
 
 The terms of a joint's equation, `torque - row theta`, are summed over time, so that the mean between any two stored
 moments requires one subtraction. These functions are part of compiled loops.
@@ -25,16 +25,16 @@ TIMES = 3.5
 """Number of standard deviations beyond which a mean residual torque counts as unexplained by the earlier model."""
 
 RELATIVE_STD = 0.1
-"""Relative standard deviation of each term of the mean (inertia, gravity, friction), since a model that fits one motion
-is not exact in the next one: in a fast swing, terms several times as large as the commanded torque cancel.
+"""Relative standard deviation of each term of the mean (inertia, gravity, friction). A model that fits one motion is
+not exact in the next: in a fast swing, terms several times as large as the commanded torque cancel.
 """
 
 IN_A_ROW = 2
-"""Number of successive lessons (model updates) with unexplained mean residual torque after which it is reported."""
+"""An unexplained mean residual torque is reported after this number of successive lessons (model updates)."""
 
 ELASTIC_RAD = 0.03
-"""Distance after a reversal over which dry friction approaches its sliding value [rad]. Their difference can at first
-be as large as static friction, and falls exponentially with the distance covered.
+"""Distance after a reversal over which dry friction approaches its sliding value [rad]. The deviation from that value
+can at first be as large as static friction; it falls exponentially with the distance covered.
 """
 
 _SLOTS = max(BACK)

@@ -26,7 +26,7 @@ def viscous(values: Values, joint: int, v: Array, step: Array) -> Array:
 
 
 def dry_level(values: Values, joint: int, v: Array) -> Array:
-    """Return the level of dry friction of `joint` (from 1) at the velocities `v`, excluding that due to load [N m]."""
+    """Return the dry friction level of `joint` (from 1) at the velocities `v`, without the part due to load [N m]."""
     level = values.get(f"coulomb_{joint}", 0.0)
     rise = values.get(f"stribeck_rise_{joint}", 0.0)
     if not rise:

@@ -27,7 +27,7 @@ class Model:
     """The arm's equations with a choice of the terms declared in `hil.estimator.models.terms`.
 
     Friction: `coulomb` is viscous v + coulomb tanh(v / coulomb_width); `stribeck` multiplies coulomb by 1 +
-    stribeck_rise exp(-(v / stribeck_velocity)^2); `stribeck_load` adds load |motor torque| to that level.
+    stribeck_rise exp(-(v / stribeck_velocity)^2); `stribeck_load` adds load |motor torque| to the product.
 
     Drive: `delay` is a pure delay of the torque in addition to that in `SettledPeriod`, `lag` a first-order lag,
     `delay_lag` both.
@@ -48,10 +48,9 @@ class Model:
         cable: adds cable_stiffness q to the load torque (the angle at which the cable is slack is part of the offset).
         encoder: a joint at q is measured to be at q + encoder_sin_once sin q + encoder_cos_once cos q +
             encoder_sin_twice sin 2q + encoder_cos_twice cos 2q.
-        lags: the second joint's torque has the lag lag + lag_difference, or without a lag the delay
-            delay + lag_difference.
+        lags: adds lag_difference to the lag of the second joint's torque or, without a lag, to its delay.
 
-    Raises ModelError for other names, for other than one or two joints, and for torque_scale with one joint.
+    Raises ModelError for unknown names, for torque_scale with one joint, and unless there are one or two joints.
     """
 
     joints: int

@@ -9,25 +9,26 @@ After a first-order low-pass filter both sides become sums over the past (genera
 Mattone, "Sensorless robot collision detection and hybrid force/motion control", ICRA 2005; J.-J. Slotine and W. Li, "On
 the adaptive control of robot manipulators", 1987). The parameters are given as the mean and covariance of an ensemble
 of arms, and are updated with each sample (recursive least squares, that is, a Kalman filter on constants that drift
-slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as it moves.
+slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as the arm moves.
 
 A joint's residual torque is the part that the motion does not account for. An alarm is raised if it exceeds three
 thresholds for `HOLD_S` (a shorter time if it far exceeds them): `TIMES` standard deviations of the uncertainty due to
 parameters and noise, the torque that friction can hold while the joint stands still, and a fraction of the largest
-planned torque. The noise is estimated as well: effects that the model lacks (Stribeck friction, backlash, flexibility)
-widen the admissible range. A deviation that could lead to an alarm enters that estimate only once it has subsided
-without one; otherwise a joint that is held for a long time would widen the range until nothing exceeded it. While a
-joint stands still, its noise is lower, since most of the noise only arises in motion.
+planned torque. The noise is estimated as well, so that effects that the model lacks (Stribeck friction, backlash,
+flexibility) widen the admissible range. A deviation that could lead to an alarm enters this estimate only after it has
+subsided without one. Otherwise, while a joint was held for a long time, the range would widen until nothing exceeded
+it. While a joint stands still, its noise is lower, since most noise arises only in motion.
 
-While a joint's angle stays within its gear's play for `_STAYS_S`, the velocity that it reports does not show in which
-direction friction acts: the motor may stick while the link floats from one side of the play to the other. Torque that
+Once a joint's angle has stayed within its gear's play for `_STAYS_S`, the reported velocity does not show in which
+direction friction acts: the motor may stick while the link floats from one side of the play to the other. A torque that
 friction in either direction could balance then does not contribute to an alarm.
 
-What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which the
-gear's presliding softens every reversal, dry friction looks viscous but still holds the joint once it has stopped.
+The torque that friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion,
+where presliding of the gear softens every reversal, dry friction looks viscous but still holds the joint once it has
+stopped.
 
-While little is known about an arm, the updates of the parameters follow a disturbance as if it were a property of the
-arm, so the mean torque over the last few tenths of a second is then also compared with an earlier state of the model
+While little is known about an arm, its parameters adapt to a disturbance as if it were a property of the arm. Therefore
+the mean torque over the last few tenths of a second is also compared with an earlier state of the model
 (`earlier_model`).
 
 Model errors, and the rounding of a velocity that stays below one tick, persist over many updates, so successive updates
@@ -109,8 +110,8 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: if this multiple of the dry friction in `mean` exceeds `largest`, thresholds are derived from it, since
-    friction near standstill differs from the model.
+    frictions: multiple of the dry friction in `mean`; thresholds are derived from this torque if it exceeds `largest`,
+    since friction near standstill differs from the model.
     hardly_known: whether only the torque is known beforehand; if so, mean torques are also compared with the earlier
     model.
     """
@@ -197,7 +198,7 @@ def _regressors(momentum: Any, rest: Any, q1: float, q2: float, v1: float, v2: f
 
 # Compiled code takes its arguments by position; m is the observer's memory, k its constants, j a joint.
 def _begin_anew(m: Any, momentum: Any, rest: Any, t1: float, t2: float) -> None:
-    """Restart, since nothing is known about the motion since the previous sample."""
+    """Restart, because the motion since the previous sample is unknown."""
     single = m[_SINGLE]
     for j in range(2):
         for i in range(_COUNT):
@@ -223,7 +224,7 @@ def _filter(m: Any, j: int, momentum: Any, rest: Any, torque: float, fallen: flo
 
 
 def _lacks(m: Any, j: int, row: Any) -> tuple[float, float]:
-    """Return the residual torque, and its variance due to the parameters, omitting terms that are zero."""
+    """Return the residual torque and the part of its variance that is due to the parameters."""
     lacking = m[_SINGLE, _TORQUE + j]
     left_open = 0.0
     for i in range(_COUNT):
@@ -253,7 +254,7 @@ def _learn(m: Any, row: Any, gain: Any, lacking: float, spread: float, first: in
 
 
 def _keep_dissipative(m: Any) -> None:
-    """Reset friction that has become negative to zero, and adjust the other parameters according to the covariance."""
+    """Replace negative friction by zero, and adjust the other parameters according to the covariance."""
     for i in range(6, 10):
         if m[_THETA, i] < 0.0 and m[_COVARIANCE + i, i] > 0.0:
             share = m[_THETA, i] / m[_COVARIANCE + i, i]
@@ -283,7 +284,7 @@ def _is_blocked(
 ) -> bool:
     """Return whether joint j stands still although its torque has varied by more than friction can hold.
 
-    distance: result of `standstill.look`. held: torque that certainly acts on it now. floor: smallest tolerance.
+    distance: result of `standstill.look`. held: torque that certainly acts on the joint now. floor: smallest tolerance.
     noise, rounding: variances of one sample's residual torque at standstill. All in SI units.
     """
     if distance == 0.0:
@@ -335,7 +336,7 @@ def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
 
 
 def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> None:
-    """Update the noise variance; the contribution of a possible alarm is deferred until it has ended."""
+    """Update the noise variance; contributions during a possible alarm are deferred until it has ended."""
     for_later = m[_PENDING]
     if pending:
         for_later[_TAUGHT + j] += taught * dt
@@ -350,7 +351,7 @@ def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> Non
 
 
 def _stays(m: Any, j: int, angle: float, velocity: float, dt: float) -> bool:
-    """Process a sample; return whether the joint moves, but has stayed within its gear's play for some time."""
+    """Process a sample; return whether the joint moves but has for some time stayed within its gear's play."""
     if abs(angle - m[_PENDING, _ANGLE + j]) > _PLAY_RAD:
         m[_PENDING, _ANGLE + j], m[_PENDING, _STAYS + j] = angle, 0.0
         return False
@@ -359,7 +360,7 @@ def _stays(m: Any, j: int, angle: float, velocity: float, dt: float) -> bool:
 
 
 def _beyond_either(m: Any, j: int, row: Any, lacking: float, static: float) -> float:
-    """Return how far a residual torque exceeds the static friction if that may act in either direction [N m]."""
+    """Return by how much a residual torque exceeds static friction, in whichever direction this acts [N m]."""
     return float(max(abs(lacking + row[8 + j] * m[_THETA, 8 + j]) - static, 0.0))
 
 

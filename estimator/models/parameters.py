@@ -51,7 +51,7 @@ class Physics:
     encoder: Array = field(default_factory=lambda: np.zeros((2, len(ENCODER))))
     """Encoder errors by joint, in the order of ENCODER (2, terms) [rad]."""
     lag_difference: float = 0.0
-    """Lag (without a lag, delay) of the second joint's torque minus that of the first joint's torque [s]."""
+    """Lag of the second joint's torque minus that of the first joint's [s]; without a lag, difference in delay."""
 
     @classmethod
     def of(cls, parameters: Mapping[str, float]) -> "Physics":
@@ -91,8 +91,8 @@ class Physics:
         return late
 
     def crossing_times(self) -> tuple[float, float]:
-        """Return the time in which a friction reversal takes each joint through its Coulomb step or bristle deflection
-        [s].
+        """Return the time [s] that a friction reversal takes to cross each joint's Coulomb step or deflect its
+        bristles.
         """
         constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))
         inertia = self.free_inertias()

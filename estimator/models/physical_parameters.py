@@ -94,7 +94,7 @@ def physical_quantities(
         joints: number of joints.
 
     Raises:
-        ModelError: for a known quantity that this arm does not have, that is not positive or whose std is negative.
+        ModelError: for a known quantity that this arm does not have, or whose value or std is impossible.
     """
     _check(known, joints)
     names = RIGID_BODY[joints]

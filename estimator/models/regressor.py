@@ -31,7 +31,7 @@ def regressor(position: Array, velocity: Array, acceleration: Array, coulomb_wid
 
     Raises:
         ShapeError: if the three arrays differ in shape.
-        ModelError: for an arm with other than one or two joints.
+        ModelError: if the arm does not have one or two joints.
     """
     if not position.shape == velocity.shape == acceleration.shape:
         raise ShapeError(

@@ -1,15 +1,15 @@
 """Detection of a blocked joint from the range of torque that acts on it without moving it.
 
-Dry friction holds a joint at rest while the torque on it stays within a band as wide as twice the static friction.
+Dry friction holds a joint at rest while the torque on it stays within a band twice as wide as the static friction.
 Where the band lies depends on gravity and offsets, which may be poorly known; its width does not. Therefore the torque
-is compared with the largest and the smallest one since the joint came to rest: at an unchanged angle, gravity and
+is compared with the largest and the smallest torque since the joint came to rest: at an unchanged angle, gravity and
 offset cancel in these differences, and so do their errors. Only changes due to the motion of other joints have to be
 modelled.
 
 A torque outside the band accelerates a free joint. The joint counts as blocked once the motion of a free joint would
 show in the velocity register. Twice the momentum of that motion is required, because only half of the excess is certain
-to act on the joint: the position of the band is unknown. If a joint does move again, friction had been holding it: a
-torque that did not move it before never raises an alarm again.
+to act on the joint as long as the position of the band is unknown. If a joint does move again, friction had been
+holding it, and no torque that it withstood will raise an alarm again.
 
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """
@@ -23,7 +23,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.compiled import inner
 
 WITHIN_RAD = 0.004
-"""Largest change in the angle of a joint that is at rest [rad]; covers encoder noise and gear play."""
+"""Largest change in the angle of a joint at rest [rad], including encoder noise and gear play."""
 
 AT_REST = 0.95
 """Filtered standstill indicator above which a joint counts as at rest; by then, the filtered deceleration has decayed.
@@ -103,7 +103,7 @@ def keep(rest: Any, first: int, row: Any) -> None:
 
 
 def variance(rest: Any, distance: float, row: Any, covariance: Any) -> float:
-    """Return the variance of the distance that `look` returned, due to the parameters' covariance [N^2 m^2]."""
+    """Return the variance, due to the parameters' covariance, of the distance that `look` returned [N^2 m^2]."""
     count = row.size
     other = rest[_SINGLES : _SINGLES + count] if distance > 0.0 else rest[_SINGLES + count :]
     total = 0.0

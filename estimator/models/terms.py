@@ -1,7 +1,7 @@
 """Declaration of every parameter that a model may have: a new term requires one entry here and its equations.
 
 Fits, results, reports, exports and the configuration take names, units, descriptions, ranges, initial guesses and
-scales from here; docs/architecture.md lists the files that a new term touches. Parameters are named `term_joint`, with
+scales from here; docs/architecture.md lists the files to change for a new term. Parameters are named `term_joint`, with
 joints counted from 1, and those of the whole arm are named just `term`. This module imports only the standard library,
 so that reading a result is fast.
 """
@@ -96,11 +96,11 @@ class Term:
     range: Range = "positive"
     """Range of values.
 
-    "any" for either sign; "positive"; "floor": above the fit's lower bound for widths; "share": a fraction, of either
-    sign, of the geometric mean of the two terms in `share_of`.
+    "any": either sign. "positive": above 0. "floor": above the fit's lower bound for widths. "share": a fraction, of
+    either sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of the two terms whose geometric mean bounds this one; those of the same joint if each joint has this term.
+    """Names of the two terms whose geometric mean bounds this one, both of the same joint if each joint has this term.
     """
     scale: Scale | float = 1.0
     """Typical change in the fit: the name of a scale of the arm and its motion, or a number [unit]."""
@@ -119,7 +119,7 @@ class Term:
     limit.
     """
     standstill: bool = False
-    """Whether the term shapes friction near standstill: its fit has local minima and needs several initial guesses."""
+    """Whether the term shapes friction near standstill, so that its fit has local minima and needs several guesses."""
     replaced_by: str | None = None
     """The option that replaces this term."""
     simulated: bool = True

@@ -1,4 +1,4 @@
-"""Missing model terms, evaluated without fitting them: score tests, and the effect of omission on standard errors.
+"""Evaluation of missing model terms without fits: score tests, and the effect of their omission on standard errors.
 
 Near an estimate the motion is linear in small changes of any parameter. One simulation with derivatives with respect to
 all of them yields the decrease in the sum of squares that each term would bring (C. R. Rao's score test, Proc.
@@ -45,7 +45,7 @@ class Candidate:
     names: tuple[str, ...]
     """Names of the parameters that are added."""
     evidence: float
-    """Decrease in the sum of squares relative to that expected by chance: above 1 it is significant."""
+    """Decrease in the sum of squares relative to that expected by chance; significant above 1."""
     explained: float
     """Fraction of the sum of squares that the term explains."""
     values: Mapping[str, float]
@@ -196,7 +196,7 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
     """Return the estimate's covariance (parameters, parameters) [SI], including the effect of omitted terms that cannot
     be ruled out.
 
-    The change that fitting them, with their prior, would cause also counts as an error.
+    A fit of these terms, with their prior, would change the parameters; these changes count as errors too.
     """
     left_out = unruled(estimate.model)
     if not left_out:

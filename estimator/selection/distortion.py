@@ -2,10 +2,10 @@
 
 The method is that of Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. An arm that is excited
 only on odd lines responds on these and, being nonlinear, on others as well. Effects that change sign with the motion
-(friction, gravity about a hanging pose) produce odd lines; others (an offset, direction-dependent friction, any other
-pose) produce even lines. Some odd lines, the detection lines, are left unexcited. If even lines are excited too, odd
-distortion appears on all lines, so the unexcited lines cannot be separated into odd and even and form a single group.
-The residual of a fit on each group, beyond the noise, is the model error of that group.
+(friction, gravity about a hanging pose) appear on odd lines; others (an offset, direction-dependent friction, gravity
+about any other pose) appear on even lines. Some odd lines, the detection lines, are left unexcited. If even lines are
+excited too, odd distortion appears on all lines, so the unexcited lines cannot be separated into odd and even and form
+a single group. On each group of lines, the part of a fit's residual that exceeds the noise is the model error.
 """
 
 from dataclasses import dataclass

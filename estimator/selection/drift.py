@@ -1,9 +1,9 @@
 """Changes in friction during motion: as grease warms up, friction falls by a few percent within minutes.
 
 A fit of one period, or of the mean of several, is valid for the middle of their time span. Other periods then show
-whether friction was larger or smaller: the difference in motion is nearly linear in one factor per joint, for viscous
-and dry friction, and in the period's initial state. A constant torque in only one of the periods is the alternative
-cause.
+whether friction was larger or smaller: the difference in motion is nearly linear in one factor per joint, which
+multiplies viscous and dry friction, and in the period's initial state. Alternatively, a constant torque in only one of
+the periods can be the cause.
 """
 
 from collections.abc import Sequence
@@ -49,8 +49,8 @@ class Drift:
         return bool(np.any((np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > LEAST)))
 
     def after_correction(self) -> "Drift":
-        """Return the change that may remain after a correction: the error of the measured change, and the part of the
-        change not linear in time.
+        """Return the change that may remain after a correction: the error of the measured change, and the part that is
+        not linear in time.
         """
         return replace(self, change=np.hypot(self.std, UNEVEN * self.change))
 
@@ -107,7 +107,7 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
 
 @dataclass(frozen=True)
 class TorqueChange:
-    """Constant torque on each joint, acting in the later periods only."""
+    """Constant torque on each joint in the later periods only."""
 
     change: Array
     """Torque (joints,) [N m]."""
@@ -166,7 +166,7 @@ def _fitted(later: "_Later", period: SettledPeriod, most: float | Array) -> tupl
 
 @dataclass(frozen=True)
 class _Later:
-    """The later period as predicted by an estimate; names: parameters that change."""
+    """The later period as predicted by an estimate whose parameters `names` may change."""
 
     estimate: Estimate
     run: Run
@@ -181,7 +181,7 @@ class _Later:
 
     def linear(self, change: Array, state: Array) -> tuple[Array, Array]:
         """Return the derivatives (samples of all joints, joints + 2 joints) and the weighted residual (samples of all
-        joints,), with the parameters changed by `change` (joints,), from the initial state `state` (2, joints).
+        joints,) of a simulation from `state` (2, joints) with the parameters changed by `change` (joints,).
         """
         physics = Physics.of(self._changed(change))
         columns, residual = [], []

@@ -1,8 +1,8 @@
 """Fit of a model with given terms, including two searches for the periods of its ripple and cogging.
 
 The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period if all other effects are modelled
-well. The linear regression cannot represent encoder errors, cables and narrow Stribeck friction. If they matter, the
-search may end at a wrong period. The second search starts from a fit of all other terms.
+well. The linear regression cannot represent encoder errors, cables or narrow Stribeck friction. If these matter, the
+search may end at a wrong period. Therefore a second search starts from a fit of all other terms.
 """
 
 from collections.abc import Mapping, Sequence
@@ -58,7 +58,7 @@ def _with_wave(
     starts: Sequence[Mapping[str, float]],
     options: SelectionOptions,
 ) -> Estimate:
-    """Return the best fit of the estimate's model with a wave, starting from its most likely numbers of cycles.
+    """Return the best fit of the estimate's model with `wave` added, from the most likely numbers of cycles.
 
     A wave is most visible in the residual of the fit that explains the most, even if its terms partly imitate the wave;
     that fit is used only for the search.

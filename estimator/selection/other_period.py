@@ -15,11 +15,11 @@ from hil.estimator.simulation.encoder import measured, without_errors
 def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
     """Predict the positions (joints, samples) [rad] of another settled period from `estimate`.
 
-    The simulation starts one period earlier, from the state measured there, and then uses only the torque. A motion
-    that counts as settled may still contain the end of a transient. If that state is not known, the arm is simulated
-    from rest until its motion repeats.
+    The simulation starts one period earlier from the measured state, since a motion that counts as settled may still
+    contain the end of a transient, and then uses only the torque. If the earlier state is not known, the arm is
+    simulated from rest until its motion repeats.
 
-    Raises PeriodicityError if that motion never repeats.
+    Raises PeriodicityError if it never does.
     """
     if other.before is not None:
         return _from_before(Physics.of(estimate.parameters), other, other.before)

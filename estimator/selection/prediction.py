@@ -1,4 +1,4 @@
-"""Errors of given parameters in predicting recordings that were not used to estimate them."""
+"""Prediction errors of given parameters on recordings that were not used to estimate them."""
 
 from collections.abc import Mapping, Sequence
 
@@ -76,8 +76,8 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
     """Return the relative error of an open-loop prediction of a settled period (joints,).
 
     This is the RMS of measured minus predicted position divided by the RMS of the motion. The arm starts at rest at the
-    period's mean position and is simulated under its torque until the motion repeats; no other measurement is used.
-    Raises PeriodicityError if the motion does not become periodic.
+    period's mean position and is simulated under the period's torque until the motion repeats; no other measurement is
+    used. Raises PeriodicityError if the motion does not become periodic.
     """
     physics = Physics.of(_complete(parameters, period.joints))
     steps = steps_per_sample(period.rate)
@@ -98,7 +98,7 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
 
 
 def _complete(parameters: Mapping[str, float], joints: int) -> dict[str, float]:
-    """Return the parameters, with a narrow Coulomb step width added for each joint that has none."""
+    """Return the parameters, with a narrow Coulomb step added for each joint that has none."""
     return {f"coulomb_width_{joint + 1}": LEAST_WIDTH for joint in range(joints)} | dict(parameters)
 
 

@@ -14,7 +14,7 @@ from hil.estimator.models.terms import FRICTIONS, Option, kind_of, term_of
 
 
 def without_nothings(estimate: Estimate, level: float, fixed: Option | None) -> Model:
-    """Return the model without parts that do not differ significantly from zero, the least significant removed first.
+    """Return the model without parts that do not differ significantly from zero, starting with the least significant.
 
     Significance is determined by A. Wald's test (Trans. AMS 54 (1943) 426): the squared distance from zero in standard
     errors, compared with chi^2 at `level`. The remaining parameters are updated with the linearised model.

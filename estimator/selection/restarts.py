@@ -1,7 +1,7 @@
 """Other initial guesses for an estimate that may be at a local minimum.
 
-The likelihood has several minima if a term acts in a narrow range: the width of the Coulomb step, the stiffness of
-bristles, and the periods of torque ripple and cogging.
+The likelihood has several minima in parameters that matter only in a narrow range: the width of the Coulomb step, the
+stiffness of bristles, and the periods of torque ripple and cogging.
 """
 
 from collections.abc import Iterator, Mapping
@@ -35,7 +35,7 @@ def left_per_joint(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def restarts(period: SettledPeriod, estimate: Estimate, options: SelectionOptions) -> Iterator[Mapping[str, float]]:
-    """Yield changed parameters, by name, from which another minimum may be reached, starting with the worst joint.
+    """Yield changed parameters, by name, from which another minimum may be reached, those of the worst joint first.
 
     Only joints whose residual exceeds `options.presliding_residual` are changed.
     """

@@ -23,7 +23,7 @@ FEWEST_ROWS = 3  # minimum number of samples per unknown of the initial state
 
 
 def missing_terms(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[Candidate]:
-    """Return the terms that could be added to the estimate's model, most significant first, by score tests."""
+    """Return the terms that could be added to the estimate's model, most significant first according to score tests."""
     richer = {part: more for part, more in richer_models(estimate.model).items() if part not in NOT_HERE}
     names = {name for more in richer.values() for name in more.names if name not in estimate.names}
     return ranked(linearised(recordings, estimate, sorted(names)), estimate.names, richer, {})
@@ -81,11 +81,12 @@ def linearised(recordings: Sequence[Recording], estimate: ShootingEstimate, name
 def held_out_errors(
     recordings: Sequence[Recording], estimate: ShootingEstimate, of: slice = ALL
 ) -> tuple[Array, float]:
-    """Return the RMS error of predicted segments relative to the motion's RMS, per joint (joints,), and its median.
+    """Return the RMS error of predicted segments relative to the motion's RMS (joints,), and the segments' median
+    error.
 
     The initial state of a segment is estimated from its first third; the rest is predicted from the torque alone. The
-    median is taken over segments, since the error can be huge if the arm tumbles. A prediction that diverges counts as
-    an error of half a turn.
+    median, which is over all joints, is robust to the huge errors of a tumbling arm. A prediction that diverges counts
+    as an error of half a turn.
     """
     problem = _posed(recordings, estimate, of)
     values, joints = estimate.parameters, estimate.model.joints

@@ -1,9 +1,9 @@
-"""Friction model selection: models are fitted from simple to rich and evaluated on a held-out motion.
+"""Friction model selection: fits models from simple to rich and evaluates them on a held-out motion.
 
-A richer model's open-loop prediction of another motion improves only if its terms are real, or by chance. Therefore it
-must also reduce the residual by more than meaningless terms would. Without another motion, the Bayesian information
-criterion is used (Schwarz, Annals of Statistics 6 (1978) 461), with the number of samples reduced according to the
-residual's correlation.
+If a richer model predicts another motion better in open loop, its additional terms are real, or the improvement is due
+to chance. Therefore it must also reduce the residual by more than meaningless terms would. Without another motion, the
+Bayesian information criterion is used (Schwarz, Annals of Statistics 6 (1978) 461), with the number of samples reduced
+according to the residual's correlation.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -49,10 +49,10 @@ def choose(
     First, Stribeck friction is fitted together with the encoders' zeros and the ratio of two torque constants, which
     are never known exactly. If that does not explain the motion, or if a score test finds a significant term in the
     residual (`hil.estimator.selection.candidates`), all other smooth terms are added at once: load, direction,
-    saturation, cables, encoder nonlinearity. If added one by one, each would absorb the effects of the missing ones;
-    together, with typical sizes as a prior, they can be separated. Then presliding friction and torque ripple are
+    saturation, cables, encoder nonlinearity. Added one by one, each would absorb the effects of those still missing;
+    added together, with typical sizes as a prior, they can be separated. Then presliding friction and torque ripple are
     tried, and finally insignificant terms are removed. A model that predicts `held_out` worse than a simpler one is not
-    chosen. If friction differs between the two recordings, it has also changed within each, which is corrected for
+    chosen. If friction differs between the two recordings, it has also changed within each; this is corrected
     (`hil.estimator.selection.steadied`).
 
     Args:
@@ -66,7 +66,7 @@ def choose(
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
         seconds: time from the middle of `periods` to that of `held_out` [s], if known.
         options: thresholds.
-        executor: a concurrent.futures executor for starting fits early that may turn out not to be needed. It does not
+        executor: a concurrent.futures executor on which fits that may not be needed are started early. It does not
             affect the choice.
 
     Raises:
@@ -118,7 +118,7 @@ class Selection:
         return self._fitting.drift
 
     def _begin(self, model: Model, near: Trial | None = None, *, coarse: bool = False) -> None:
-        """Start a fit that may be needed, if there is an executor; it becomes a trial only when needed."""
+        """If there is an executor, start a fit in advance; it becomes a trial only when needed."""
         key = (model, id(near), coarse)
         if self._executor is not None and key not in self._begun:
             self._begun[key] = self._executor.submit(self._fitting.trial, model, near, {}, coarse)
@@ -172,8 +172,8 @@ class Selection:
         return self._better(best, self._try_or_none(best.model.without("presliding"), best)) or best
 
     def _with_bristles(self, best: Trial) -> Trial:
-        """Add presliding to a model that explains nearly everything, starting from its minimum: no wider search is
-        needed.
+        """Add presliding to a model that explains nearly everything; the fit starts from its minimum, without a wider
+        search.
         """
         if best.estimate is None or "presliding" in best.model.options:
             return best
@@ -188,8 +188,8 @@ class Selection:
     def _closest(self) -> list[Trial]:
         """Return the trials that explain the most, with and without presliding, best first.
 
-        Ripple is most visible where other terms explain the most, even if they are not significant yet; but bristles
-        may have absorbed part of it.
+        Ripple is most visible in the fit that explains the most, even if some of its terms are not significant, but
+        bristles may have absorbed part of the ripple.
         """
         fitted = sorted((each for each in self.trials if each.estimate is not None), key=self._left)
         kinds = {"presliding" in each.model.options: each for each in reversed(fitted)}
@@ -226,7 +226,7 @@ class Selection:
         return trial
 
     def _use(self, periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, drift: Drift | None) -> None:
-        """Fit these periods from now on, discarding trials and started fits of other periods."""
+        """Fit these periods from now on; discard the trials and pending fits of the former ones."""
         self._periods = list(periods)
         self._fitting = replace(self._fitting, periods=self._periods, held_out=held_out, drift=drift)
         self.trials = []
@@ -266,7 +266,7 @@ class Selection:
         return found
 
     def _waving(self, plain: Trial | None, wave: Candidate) -> Trial | None:
-        """Return `plain` with the wave, and encoder errors if needed, if these explain nearly everything, else None."""
+        """Return `plain` with the wave and, if needed, encoder errors; None unless this explains nearly everything."""
         if plain is None or wave.evidence < 1.0:
             return None
         named = {name: value if "cycles" in name else 0.0 for name, value in wave.values.items()}
@@ -283,7 +283,7 @@ class Selection:
         return self._left(trial) < self._options.presliding_residual**2
 
     def _converged(self, trial: Trial) -> Trial:
-        """Return a fit to full precision, since fits that leave much unexplained stop early during model comparison."""
+        """Refit to full precision a trial that stopped early because much remained unexplained."""
         if not trial.coarse or self._is_explained(trial):
             return trial
         return self._try_or_none(trial.model, trial) or trial
@@ -336,7 +336,7 @@ class Selection:
         return best
 
     def _pruned_by_fits(self, best: Trial) -> Trial:
-        """Remove terms one by one, assessing each by a fit without it, if the motion is too sensitive for standard
+        """Remove terms one by one, testing each by a fit without it, since the motion is too sensitive for standard
         errors.
         """
         for part, plainer in removable_parts(best.model):
@@ -392,7 +392,7 @@ class Selection:
             return None
 
     def _try(self, model: Model, near: Trial | None, values: Mapping[str, float], *, coarse: bool = False) -> Trial:
-        """Fit from the result of `near`, using `values` for parameters that it lacks, or from scratch."""
+        """Fit from scratch or from the result of `near`, in which `values` replace or add parameters."""
         begun = None if values else self._begun.pop((model, id(near), coarse), None)
         trial = self._fitting.trial(model, near, values, coarse) if begun is None else begun.result()
         self.trials.append(trial)

@@ -1,4 +1,4 @@
-"""Correction of periods for friction that changes while they are recorded, such as while grease warms up.
+"""Correction of periods for friction that changes while they are recorded, for example because grease warms up.
 
 A fit assumes constant friction. If friction changes by a fraction c per second, the fit lacks the torque c (t -
 t_middle) F(t), where F is the friction torque. F follows from the measured motion and a first fit, and c from a later

@@ -1,4 +1,4 @@
-"""A fitted model and its performance, the choice among several, and the data to which they are fitted."""
+"""Fitted models with their performance, the choice among them, and the data to which they are fitted."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ QUICK = LikelihoodOptions(
     integration=IntegrationOptions(max_substeps=16),
     coarse_integration=IntegrationOptions(max_step=2.6e-3, max_substeps=8),
 )
-"""Options for quick fits: with few iterations and substeps, little time is lost if bristles become extremely stiff."""
+"""Options for quick fits: few iterations and substeps, to lose little time if bristles become extremely stiff."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Choice:
     def cost(self) -> float:
         """Factor by which the added terms increase the standard errors of the base parameters (geometric mean).
 
-        The reference is the standard errors that would result if the added terms were known exactly.
+        The reference is what the standard errors would be if the added terms were known exactly.
         """
         estimate = self.estimate
         std = estimate.std
@@ -105,8 +105,7 @@ class Fitting:
     """Change in friction from the fitted periods to `held_out`; both are corrected for it."""
 
     def trial(self, model: Model, near: Trial | None, values: Mapping[str, float], coarse: bool) -> Trial:
-        """Fit `model` from the result of `near`, using `values` for the parameters that this result lacks, or from
-        scratch.
+        """Fit `model` from scratch or from the result of `near`, in which `values` replace or add parameters.
 
         Raises ConvergenceError.
         """

@@ -4,9 +4,9 @@ As for settled periods (`hil.estimator.selection.settled`), Stribeck friction is
 the motion, or if score tests find a significant term, all other smooth terms are added at once, with their typical
 sizes as a prior; then insignificant terms are removed.
 
-If the motion is explained down to the noise, the likelihood decides. Otherwise a richer model may merely compensate for
-another missing term. Then every other segment of each recording is fitted and the rest are predicted, by models with
-presliding friction as well.
+If the motion is explained down to the noise, the likelihood decides. Otherwise, since a richer model may merely
+compensate for another missing term, every other segment of each recording is fitted and the rest are predicted; models
+with presliding friction are tried as well.
 """
 
 import time
@@ -105,8 +105,8 @@ def choose_by_shooting(
 def held_out_error(recordings: Sequence[Recording], estimate: ShootingEstimate, start: Array) -> Array | None:
     """Fit the estimate's model to every other segment and return its prediction error on the remaining ones (joints,).
 
-    The error is the RMS error relative to the motion's RMS. None if the fit does not converge or no recording has two
-    segments. start: initial guess as in `estimate_by_shooting`.
+    The error is the RMS error relative to the motion's RMS. Returns None if the fit does not converge or no recording
+    has two segments. start: initial guess as in `estimate_by_shooting`.
     """
     length, zeros = estimate.segment_length, bool(estimate.zeros.size)
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):

@@ -1,4 +1,4 @@
-"""Checks of an estimate: residual over rounding, whiteness, conditioning, open-loop simulation, Fourier lines."""
+"""Checks of an estimate: residual relative to noise, whiteness, conditioning, open-loop simulation, Fourier lines."""
 
 from dataclasses import dataclass
 
@@ -60,8 +60,8 @@ class Validation:
     relative_std: dict[str, float]
     """Relative standard error of each base parameter except offsets."""
     torque_std: dict[str, float]
-    """Standard error of the torque that each base parameter except offsets contributes, relative to the joint's torque
-    (RMS), for the worst joint.
+    """Standard error of each base parameter except offsets, expressed as a torque relative to the joint's RMS torque,
+    for the worst joint.
     """
     levels: Levels
 

@@ -60,8 +60,8 @@ class Evidence:
     """RMS error of the open-loop prediction of a held-out motion, relative to that motion's RMS (joints,), excluding
     encoder noise.
 
-    If friction has changed since the fitted motion, the prediction uses one factor per joint taken from the held-out
-    motion itself.
+    If friction has changed since the fitted motion, the prediction uses one friction factor per joint, estimated from
+    the held-out motion itself.
     """
     held_out_as_fitted: Array | None = None
     """Like `held_out`, but with friction as it was in the fitted motion (joints,); None if it has not changed."""

@@ -29,7 +29,7 @@ def wave_peaks(
     """Return the numbers of `cycles` per turn at which a wave explains more of the residual than at neighbouring
     numbers, best first.
 
-    Whatever the fitted parameters can explain is removed from residual and waves first. The result is keyed by
+    Whatever the fitted parameters can explain is first removed from the residual and the waves. The result is keyed by
     parameter name. If other terms have absorbed part of a wave, the best number may be wrong. Therefore other numbers
     are returned as well if they explain at least `COMPARABLE` times as much of the sum of squares as the best one.
 
@@ -61,8 +61,8 @@ def wave_peaks(
 def ranked_cycles(peaks: Mapping[str, Sequence[float]], most: int) -> list[dict[str, float]]:
     """Return at most `most` combinations of cycles per turn, keyed by parameter name, best first.
 
-    The n-th combination takes the n-th best candidate of each wave in `peaks`, the result of `wave_peaks`, or its last
-    one if it has fewer.
+    For each wave in `peaks`, the result of `wave_peaks`, the n-th combination takes the n-th best candidate or, if
+    there are fewer, the last one.
     """
     ranks = min(most, max(map(len, peaks.values()), default=0))
     return [{name: each[min(rank, len(each) - 1)] for name, each in peaks.items()} for rank in range(ranks)]
@@ -74,7 +74,7 @@ def without_height(wave: Wave, joints: Iterable[int]) -> dict[str, float]:
 
 
 def _peaks(cycles: Sequence[float], falls: Array) -> tuple[float, ...]:
-    """Return those `cycles` whose decrease in the sum of squares is a local maximum, the largest first."""
+    """Return those `cycles` at which the decrease in the sum of squares has a local maximum, the largest first."""
     order = np.argsort(cycles)
     padded = np.concatenate(([-1.0], falls[order], [-1.0]))
     is_peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])

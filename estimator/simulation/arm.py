@@ -1,4 +1,4 @@
-"""The arm's compiled simulation under given motor torques, the most time-critical loop of the estimator.
+"""The compiled simulation of an arm under given motor torques: the most time-critical loop of the estimator.
 
 The equations are those of `hil.estimator.models.regressor` with a smooth friction law:
 
@@ -15,11 +15,11 @@ described by the offset. With presliding, the term level(v) tanh(v / width) is r
 `hil.estimator.simulation.bristles`. `hil.estimator.simulation.sensitivity` differentiates these equations and this
 integration scheme.
 
-Each step uses the two-stage Rosenbrock method ROS2 (Verwer, Spee, Blom, Hundsdorfer 1999), which is L-stable for the
-slope of friction, the only part of the Jacobian that is included, and second-order regardless of what the Jacobian
-omits. While a joint is near standstill, where tanh is steep, a step is divided into smaller ones. Compared with a
-hundred steps per sample, three at 400 Hz are accurate to 0.003 encoder steps RMS for widths from 0.0003 to 0.05 rad/s;
-one is accurate to 0.05 in a third of the time.
+Each step uses the two-stage Rosenbrock method ROS2 (Verwer, Spee, Blom, Hundsdorfer 1999). Only the slope of friction
+is included in the Jacobian: the method is L-stable for this slope, and second-order whatever the Jacobian omits. While
+a joint is near standstill, where tanh is steep, a step is divided into smaller ones. Compared with a hundred steps per
+sample, three at 400 Hz are accurate to 0.003 encoder steps RMS for widths from 0.0003 to 0.05 rad/s; one is accurate to
+0.05 in a third of the time.
 """
 
 import math
@@ -69,10 +69,10 @@ def simulate(
     Args:
         physics: physical constants.
         start: state at the first sample (2 or 3, joints): angles [rad], velocities [rad/s] and optionally the torque of
-            the bristles [N m], by default that in steady sliding.
-        torque: mean motor torque over each step after each sample (joints, samples, steps) [N m].
+            the bristles [N m], by default as in steady sliding.
+        torque: mean motor torque over each of the steps that follow a sample (joints, samples, steps) [N m].
         step: length of a step [s].
-        max_substeps: maximum number of substeps into which a step is divided when a joint is near standstill.
+        max_substeps: maximum number of substeps into which a step is divided near standstill.
         springs: stiffness of additional springs (joints,) [N m/rad] and the angles to which they pull the joints, held
             between samples (joints, samples) [rad].
 
@@ -118,7 +118,7 @@ def bump_at(ratio: float) -> float:
 
 
 def bend_at(v: float, sharp: float) -> tuple[float, float]:
-    """Return tanh(v sharp) and its derivative with respect to v, using one exponential, which takes half as long as the
+    """Return tanh(v sharp) and its derivative with respect to v, using one exponential; this takes half as long as the
     library's tanh.
     """
     past = 2.0 * abs(v) * sharp

@@ -1,14 +1,14 @@
 """Back-EMF of joints driven by voltage: part of the motor torque, with the same lag as the voltage.
 
 A voltage u drives the current i through the winding, lag i' = (u - k v) / R - i, so the back-EMF passes through the
-same lag as the command. The fraction `back_emf` of viscous friction is due to it, b = k^2 / R. The equivalent motor,
-with a lagging voltage and a brake b without lag, is
+same lag as the command. It causes the fraction `back_emf` of viscous friction, b = k^2 / R. The equivalent motor, with
+a lagging voltage and a brake b without lag, is
 
     1 / (lag J s^2 + J s + b) = 1 / ((lag' s + 1) ((J - b lag') s + b)),    lag' (J - b lag') = lag J
 
-which is exact for a joint of inertia J: it moves like one with an inertia smaller by b lag'. `Physics.of` subtracts
-back_emf viscous (lag + delay) from the joint's own inertia, 5 to 10 % of it on an XL430. The estimated lag is lag',
-slightly larger than that of the winding.
+This is exact for a joint of inertia J, which moves as if its inertia were smaller by b lag'. Therefore `Physics.of`
+subtracts back_emf viscous (lag + delay) from the joint's own inertia: 5 to 10 % of it on an XL430. The estimated lag is
+lag', slightly larger than that of the winding.
 
 If the voltage is later than the back-EMF by d, because a goal waits for the servo's control loop, the estimated inertia
 is too large by b d, whatever the lag.
@@ -46,8 +46,8 @@ def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:
 def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Array:
     """Return derivatives (joints, samples, causes) with respect to the parameters `names`, then the remaining causes.
 
-    They are computed from `derivative`, the simulation's derivatives with respect to `causes_of` these names and the
-    same remaining causes. In the simulation viscous friction, back-EMF and the joint's inertia are separate constants.
+    They are computed from `derivative`, the simulation's derivatives with respect to what `causes_of` returns and the
+    same remaining causes. In the simulation, viscous friction, back-EMF and the joint's inertia are separate constants.
     """
     joints = _generating(physics)
     if not joints:
@@ -76,10 +76,10 @@ def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Arr
 def neglected_inertia(brake: float, lost: float, inertia: float, delay: float) -> float:
     """Return the standard deviation of a joint's inertia due to effects that this model neglects [kg m^2].
 
-    The effect of friction on the motor's current is late by lag' - lag: negligible on most arms, but 5 % of the inertia
-    of an XL430 with hardly any load. The voltage's delay d contributes 1 to 2 %.
+    The effect of friction on the motor's current is late by lag' - lag. On most arms this is negligible, but it amounts
+    to 5 % of the inertia of an XL430 with hardly any load. The voltage's delay d contributes 1 to 2 %.
 
-    brake: b [N m s/rad]. lost: b lag' [kg m^2]. delay: pure delay [s], perhaps of the voltage alone.
+    brake: b [N m s/rad]. lost: b lag' [kg m^2]. delay: pure delay [s], which may be of the voltage alone.
     """
     return math.hypot(lost**2 / inertia, brake * max(UNKNOWN_DELAY, 0.5 * delay))
 

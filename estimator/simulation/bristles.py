@@ -2,16 +2,16 @@
 
     friction = b + damping (1 - b / +-level(v)) v        b' = stiffness v (1 - b / +-level(v))
 
-with the sign of the velocity v and the level of `hil.estimator.simulation.arm`: C. Canudas de Wit, H. Olsson, K. J.
-Astrom and P. Lischinsky, "A new model for control of systems with friction", IEEE Transactions on Automatic Control 40
-(1995) 419. Here b is the bristles' torque. Viscous friction is added as usual.
+with the sign of the velocity v and the level of `hil.estimator.simulation.arm`. Source: C. Canudas de Wit, H. Olsson,
+K. J. Astrom and P. Lischinsky, "A new model for control of systems with friction", IEEE Transactions on Automatic
+Control 40 (1995) 419. Here b is the bristles' torque. Viscous friction is added as usual.
 
 A step of the arm is split (Strang, SIAM Journal on Numerical Analysis 5 (1968) 506). In the first half, the bristles
-deflect at the step's initial velocity, which is solved exactly; then the arm moves with their torque as an additional
-offset and their damping as additional viscous friction; in the second half, they deflect at the final velocity. The
-level is evaluated at the mid-step velocity, which for the first half is predicted from the last step's acceleration.
-Otherwise the level would be half a step late. Compared with a hundred steps per sample, three at 400 Hz are accurate to
-0.03 encoder steps RMS for 5 to 1000 N m/rad.
+deflect at the step's initial velocity (solved exactly); then the arm moves with their torque as an additional offset
+and their damping as additional viscous friction; in the second half, they deflect at the final velocity. The level is
+evaluated at the mid-step velocity, which for the first half is predicted from the last step's acceleration. Otherwise
+the level would be half a step late. Compared with a hundred steps per sample, three at 400 Hz are accurate to 0.03
+encoder steps RMS for 5 to 1000 N m/rad.
 """
 
 import math
@@ -35,7 +35,7 @@ VISCOUS, COULOMB, OFFSET, RISE, FADING, LOAD, SCALE, STIFFNESS, DAMPING, SATURAT
 
 
 def has_bristles(physics: Physics) -> bool:
-    """Return whether any joint has presliding friction, which yields before the joint slides."""
+    """Return whether any joint has presliding friction."""
     return bool(np.any(physics.vector[STIFFNESS : STIFFNESS + 2] > 0.0))
 
 

@@ -102,9 +102,7 @@ class Stabilised:
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
-    """Return the physics with the delay added to the lag, minus `command_to_sample` [s]: commands act that much
-    earlier.
-    """
+    """Add the delay to the lag and subtract the `command_to_sample` [s] by which commands act earlier."""
     return replace(physics, lag=max(physics.lag + physics.delay - command_to_sample, 1e-5), delay=0.0)
 
 

@@ -13,7 +13,7 @@ from hil.estimator.compiled import compiled, inner
 def motor_torque(
     command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float | Array, lag: float | Array
 ) -> Array:
-    """Return the mean motor torque over each of `steps` equal steps after each sample (joints, samples, steps) [N m].
+    """Return the mean motor torque (joints, samples, steps) [N m] over each of the `steps` steps that follow a sample.
 
     The means are exact, even for a step in which the command changes.
 
@@ -113,10 +113,10 @@ def _average_loop(
 
 
 def _follow(command: Any, j: int, rate: float, lag: float, lagging: Any) -> None:
-    """Compute joint j's periodic steady-state lagging torque at the commands, and its derivative with respect to lag.
+    """Compute joint j's periodic lagging torque at each command, and its derivative with respect to lag.
 
     The result is written to `lagging` (2, samples). The torque obeys y[k + 1] = a y[k] + (1 - a) u[k]; the steady state
-    follows from its value after one period starting from zero.
+    follows from the value after one period that starts at zero.
     """
     samples = command.shape[1]
     a = math.exp(-1.0 / (rate * lag)) if lag > 0.0 else 0.0

@@ -20,7 +20,7 @@ from hil.estimator.simulation.bristles import has_bristles, without_dry_friction
 from hil.estimator.simulation.closed_loop import Feedback, respond_compiled
 
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=4)
-"""Integration for peaks and overshoots: accurate to a few milliradians, ten times as fast."""
+"""Integration for peaks and overshoots: accurate to a few milliradians, and ten times as fast as the default."""
 LOWEST, HIGHEST, VELOCITY, TORQUE, POWER = range(5)
 """Rows of the peak values."""
 
@@ -73,7 +73,7 @@ class ManyArms:
     def peaks(
         self, multisines: Sequence[Commands], rate: float, settling: SettlingRule
     ) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Return the extreme values of each arm, and when it settled.
+        """Return each arm's extreme values, and when it settled.
 
         The values (arms, 5, joints) are lowest and highest angle [rad], speed [rad/s], assumed torque [N m], and
         assumed torque times speed [W]. The second array (arms,) is the number of periods of the first multisine that
@@ -171,7 +171,7 @@ def _raise(values: Any, position: Any, velocity: Any, torque: Any, scale: Any) -
 
 @_inner
 def _difference(former: Any, latest: Any) -> float:
-    """Return the worst joint's RMS difference of the second halves of two periods, relative to the motion's RMS."""
+    """Return the worst joint's RMS difference between two periods' second halves, relative to the motion's RMS."""
     samples = former.shape[1]
     half = samples // 2
     count = samples - half

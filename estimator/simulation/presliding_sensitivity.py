@@ -1,6 +1,6 @@
 """Forward sensitivities of an arm with presliding friction.
 
-`hil.estimator.simulation.bristles` splits a step. Here the derivatives of its parts are propagated together with those
+`hil.estimator.simulation.bristles` splits a step. Here the derivatives of the parts are propagated together with those
 of the arm's own step, in which the bristles' torque is an additional offset and their damping additional viscous
 friction.
 """
@@ -49,7 +49,7 @@ from hil.estimator.simulation.sensitivity import (
 
 
 def sensitive(physics: Physics) -> "type[Sensitive]":
-    """Return the class that simulates an arm with these constants, with derivatives."""
+    """Return the class that simulates an arm with these constants, including derivatives."""
     return PreslidingSensitive if has_bristles(physics) else Sensitive
 
 

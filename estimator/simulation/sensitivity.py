@@ -82,7 +82,7 @@ class Sensitive:
     start: angles [rad] and velocities [rad/s] at the first sample (2, joints).
     causes: names of the quantities with respect to which to differentiate, from CAUSES.
     step: length of an integration step [s].
-    max_substeps: maximum number of substeps into which a step is divided when a joint is near standstill.
+    max_substeps: maximum number of substeps into which a step is divided near standstill.
     tracking_stiffness: stiffness of additional springs that pull the joints to given angles (joints,) [N m/rad].
     """
 
@@ -123,11 +123,11 @@ class Sensitive:
         """Simulate as many samples as `torque` has.
 
         Args:
-            torque: mean motor torque over each step after each sample (joints, samples, steps) [N m].
+            torque: mean motor torque over each of the steps that follow a sample (joints, samples, steps) [N m].
             torque_slopes: its derivatives with respect to delay and each joint's lag (2, joints, samples, steps)
                 [N m/s].
             tracked: angles to which the springs pull, held between samples (joints, samples) [rad].
-            tracked_slopes: its derivatives with respect to the encoder errors of the same joint (joints, samples,
+            tracked_slopes: their derivatives with respect to the encoder errors of the same joint (joints, samples,
                 errors).
 
         Returns:

@@ -63,7 +63,7 @@ def _counted(count: int, what: str) -> str:
 
 
 def check(config: ConfigLike, *, on_progress: OnProgress = ignore) -> CheckReport:
-    """Check port, servos, pose and sample rate with torque off: `hil check` as a function. Nothing moves.
+    """Check port, servos, pose and sample rate with torque off (`hil check` as a function). Nothing moves.
 
     A check that cannot be carried out is reported as a finding, not raised as an exception.
 

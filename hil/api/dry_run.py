@@ -109,7 +109,7 @@ def dry_run(
     executor: Executor | None = None,
     on_progress: OnProgress = ignore,
 ) -> Rehearsal:
-    """Simulate the experiment on arms consistent with what is known about the real one: `hil dry-run` as a function.
+    """Simulate the experiment on arms consistent with what is known about the real one (`hil dry-run` as a function).
 
     Args:
         config: TOML file of the arm, the name of a bundled one, or a loaded configuration.

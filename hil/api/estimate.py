@@ -34,7 +34,7 @@ def estimate(
     executor: Executor | None = None,
     on_progress: OnProgress = ignore,
 ) -> Identification | Estimation:
-    """Estimate an arm's parameters from a recording: `hil estimate` as a function.
+    """Estimate an arm's parameters from a recording (`hil estimate` as a function).
 
     Args:
         recording: a run folder or a `Run` (its result.json is rewritten), or one or more recordings of one arm made
@@ -102,7 +102,7 @@ def _check_types(config: Any, out: Any, all_samples: Any) -> None:
 
 
 def are_recordings(paths: Sequence[Path]) -> bool:
-    """Whether the paths are recordings from other tools rather than one run folder. Raises ValueError if mixed."""
+    """Whether the paths are recordings from other tools rather than one run folder. Raises ValueError for a mixture."""
     if not paths:
         raise ValueError("no recording is given: name a run folder, or recordings (CSV, Parquet, MCAP).")
     files = [is_recording(path) for path in paths]

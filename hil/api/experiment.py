@@ -31,7 +31,7 @@ __all__ = ["identify", "record"]
 log = logging.getLogger(__name__)
 
 _UNSETTLED = re.compile("TORQUE IS ON|could not be restored")
-"""If an error message matches, the state of the servos must be checked before anything else."""
+"""If an error message matches this, the state of the servos must be checked before anything else."""
 
 
 def identify(
@@ -42,7 +42,7 @@ def identify(
     start_from: str | PathLike[str] | None = None,
     on_progress: OnProgress = ignore,
 ) -> Identification:
-    """Excite the arm, record a settled period and estimate the arm's parameters: `hil identify` as a function.
+    """Excite the arm, record a settled period and estimate the arm's parameters (`hil identify` as a function).
 
     The arm moves. Torque is off when this function returns or raises.
 
@@ -105,7 +105,7 @@ def record(
     take_over: bool = False,
     on_progress: OnProgress = ignore,
 ) -> Run:
-    """Run the experiment and store its recording for a later estimate: `hil record` as a function.
+    """Run the experiment and store its recording for a later estimate (`hil record` as a function).
 
     The arm moves. Arguments and exceptions are as for `identify`.
     """

@@ -41,7 +41,7 @@ OnProgress = Callable[[Progress], None]
 
 
 def forgiving(listener: OnProgress) -> OnProgress:
-    """Wrap a callback so that its first exception is logged and it is not called again.
+    """Wrap a callback so that it is not called again after its first exception, which is logged.
 
     A StopRequested or KeyboardInterrupt raised during the callback (Ctrl-C, for example) does not count as a failure of
     the callback and is passed on.

@@ -72,7 +72,7 @@ def _how_to_compare(config: Config) -> str:
 
 
 def _weak(joint: JointConfig) -> str:
-    """Warn if a joint's limit allows no more torque than the typical friction of its servos; otherwise return ""."""
+    """Return a warning if a joint's limit allows no more torque than its servos' typical friction; otherwise ""."""
     friction = len(joint.ids) * servo_prior(joint.joint.servo).coulomb.median
     torque = joint.goal_limit * joint.torque_per_goal
     if torque > friction:

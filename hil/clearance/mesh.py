@@ -1,4 +1,4 @@
-"""Vertices of a mesh file, for its bounding box: STL (binary or text) and OBJ."""
+"""Vertices of an STL (binary or text) or OBJ mesh file, for its bounding box."""
 
 from pathlib import Path
 

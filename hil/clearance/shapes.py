@@ -103,7 +103,7 @@ def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule
 class Solid:
     """A primitive of a file's collision geometry, in the frame of its moving link.
 
-    link: 0 for the fixed base. kind: "box", "cylinder", "capsule", "sphere" or "mesh". size: as in MuJoCo: half edge
+    link: 0 for the fixed base. kind: "box", "cylinder", "capsule", "sphere" or "mesh". size: as in MuJoCo, half edge
     lengths, or radius and half length [m]; empty for a mesh. rotation (3, 3), translation (3,) [m]: its pose.
     """
 
@@ -156,7 +156,7 @@ def _of_geom(geom: Geom) -> list[tuple[Array, float]]:
 
 
 def _pieces(capsule: Capsule) -> list[Capsule]:
-    """Split a capsule, because the piece next to a joint is allowed to touch a link that the other pieces must not."""
+    """Split a capsule, because the piece next to a joint is allowed to touch a link that the rest must not touch."""
     length = float(np.linalg.norm(capsule.ends[1] - capsule.ends[0]))
     if not length < np.inf:
         return [capsule]  # rejected by `shapes_of`
@@ -292,6 +292,6 @@ def _origin(element: ET.Element) -> tuple[Array, Array]:
 
 
 def _numbers(text: str | None, count: int, default: float = float("nan")) -> list[float]:
-    """Parse `count` numbers: all defaults if there is no text, all NaN if it holds more or fewer numbers."""
+    """Parse `count` numbers; return only defaults if there is no text, only NaN if it holds more or fewer numbers."""
     found = [default] * count if text is None else [float(word) for word in text.split()]
     return found if len(found) == count else [float("nan")] * count

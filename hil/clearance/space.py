@@ -48,7 +48,7 @@ LYING_RAD = 0.12
 class Nearest:
     """The sample of a motion with the least clearance.
 
-    distance: between the members of `pair` [m]. needed: required distance [m]. sample: its index.
+    distance: between the members of `pair` [m]. needed: required distance [m]. sample: index of the sample.
     """
 
     distance: float
@@ -86,7 +86,7 @@ class Space:
     is_touched: Mask
     """Whether, in the rest pose, anything might touch the part of the arm that each joint moves (joints,)."""
     _built: Array
-    """Median distance of pairs that are near each other by design, otherwise infinite (pairs,) [m]."""
+    """Median distance of pairs that are near each other by design (pairs,) [m]; infinite for other pairs."""
     _pairs: NDArray[np.int64]
     _chain: tuple[Array, Array, Array]
     _arrays: tuple[NDArray[np.int64], Array, Array, Array, Array]

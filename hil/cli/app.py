@@ -106,7 +106,7 @@ def _one_blas_thread() -> None:
     """Limit BLAS to one thread unless the user chose a number. BLAS reads the number when numpy is first imported.
 
     hil's matrices are small. On two busy cores, two spinning threads took 91 ms for a singular value decomposition that
-    took one thread 1 ms.
+    one thread finished in 1 ms.
     """
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")

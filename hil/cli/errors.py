@@ -75,7 +75,7 @@ class Command(TyperCommand):
 def stop_behind(error: BaseException) -> Exception | None:
     """Return the stop request that was being handled when a closed terminal caused `error`; None if there was none.
 
-    Closing a terminal sends SIGHUP; from then on, it rejects all output.
+    Closing a terminal sends SIGHUP; from then on, the terminal rejects all output.
     """
     from hil.errors import StopRequested
 

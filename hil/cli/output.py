@@ -21,7 +21,7 @@ _PIECE, _POLL_S = 256, 0.1
 
 
 def require_output() -> None:
-    """Exit if standard output is closed (`>&-`): the next file opened would take its place."""
+    """Exit if standard output is closed (`>&-`); otherwise the next file opened would take its place."""
     if sys.stdout is None:
         print("hil: standard output is closed. Redirect it, for example to /dev/null.", file=sys.stderr)
         sys.exit(1)
@@ -50,7 +50,7 @@ def bounded_output() -> Iterator[None]:
     """Let the program end after a signal even if its terminal is stopped (Ctrl-S) or nobody reads its output.
 
     Until a signal arrives, output waits indefinitely. Only terminals and pipes are handled in this way, and only in
-    the main thread: the files of a run folder are completed and closed without them.
+    the main thread; the files of a run folder are completed and closed regardless.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -74,7 +74,7 @@ def bounded_output() -> Iterator[None]:
 
 
 def _bounded(stream: Any, patience: "_Patience") -> Any:
-    """Return a stream to the same terminal or pipe that waits no longer than `patience`; any other stream unchanged."""
+    """Return a stream to the same terminal or pipe that waits at most `patience`; return other streams unchanged."""
     try:
         number = stream.fileno()
         mode = os.fstat(number).st_mode

@@ -19,8 +19,8 @@ def find_config(path: Path) -> Path:
 
 
 def meant(path: Path) -> str:
-    """Return a hint for a `path` that does not exist: the same name with ".toml", or bundled configurations, whose
-    names are those of the files in configs/. "" if there is no hint.
+    """Return a hint for a `path` that does not exist: the same name with ".toml", or the names of bundled
+    configurations; "" if there is no hint.
     """
     if path.suffix == "" and not path.exists() and path.with_suffix(".toml").is_file():
         return f" Did you mean {path.with_suffix('.toml')}?"

@@ -145,7 +145,7 @@ class Columns(Table):
         return self
 
     def _one_role_each(self) -> None:
-        """Refuse a column that is named twice: its values cannot be two quantities."""
+        """Refuse a column that is named twice, since its values cannot represent two quantities."""
         roles = [("columns.time", [self.time] if self.time else []), ("columns.position", self.position or [])]
         if self.drive is not None:
             roles.append((f"columns.{self.drive}", getattr(self, self.drive)))

@@ -1,4 +1,4 @@
-"""URLs of fake arms, whose path is relative to the configuration file that names them."""
+"""URLs of fake arms; their paths are relative to the configuration file that names them."""
 
 import os
 from pathlib import Path

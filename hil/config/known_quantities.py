@@ -52,7 +52,7 @@ class KnownConfig(BaseModel):
         return self
 
     def quantities(self) -> dict[str, Known]:
-        """The known quantities by the names of hil.estimator.models.physical_parameters.
+        """The known quantities, keyed by the names in hil.estimator.models.physical_parameters.
 
         Rotor inertia times gear ratio squared is returned as armature.
         """

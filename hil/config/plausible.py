@@ -1,7 +1,7 @@
-"""Detection of unit errors, such as degrees for radians, mm for m, or mA for A, which leave a file valid but dangerous.
+"""Detection of unit errors (such as degrees for radians, mm for m, mA for A) that leave a file valid but dangerous.
 
-Every physical quantity is compared, with a wide margin, with what a servo of that model could move: external gears,
-light plastic links and heavy test rigs pass; a factor due to a wrong unit does not.
+Every physical quantity is compared with what a servo of that model could move. The margin is so wide that external
+gears, light plastic links and heavy test rigs pass, but wrong units do not.
 """
 
 import math
@@ -26,7 +26,7 @@ of the usual value.
 
 _MOST_ROTOR = 1e-4  # kg m^2, on the motor's side of the gears
 _GEAR = 8.0
-"""Largest plausible ratio of a torque constant to the published one, with an external gear or a very rough guess."""
+"""Largest plausible ratio of a torque constant to the published one, allowing for external gears and rough guesses."""
 
 _SPEED = 4.0
 """Largest plausible ratio of the velocity limit to the no-load speed at the highest published supply voltage."""
@@ -182,6 +182,6 @@ def _too_much(key: str, value: float, most: float, unit: str, joint: "JointConfi
 
 
 def _meant(value: float, unit: str, most: float, least: float = 0.0) -> str:
-    """Return ". If it is in mm, write 0.147" for the units in which the value would be plausible; "" if in none."""
+    """Return ". If it is in mm, write 0.147" for the unit in which the value is plausible; "" if there is none."""
     hint = in_other_units(value, unit, lambda converted: least <= abs(converted) <= most)
     return f". {hint}" if hint else ""

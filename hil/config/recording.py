@@ -1,7 +1,7 @@
 """Description of an arm whose recording was made elsewhere: the recording's columns, and some properties of the arm.
 
-The TOML file of an experiment can be used, or a shorter one; tables and keys that only an experiment needs are
-ignored, unknown ones are errors.
+The TOML file of an experiment can be used, or a shorter one. Tables and keys that only an experiment needs are
+ignored; unknown ones are errors.
 
     [arm]
     gravity = 9.81
@@ -110,7 +110,7 @@ def _without(table: dict[str, Any], used: type[BaseModel], known: type[BaseModel
 
 
 def _with_urdf_beside(values: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the tables with a relative arm.urdf resolved relative to the TOML file's folder."""
+    """Return the tables; arm.urdf, if relative, is resolved against the TOML file's folder."""
     arm = values.get("arm")
     if isinstance(arm, dict) and isinstance(arm.get("urdf"), str):
         return {**values, "arm": {**arm, "urdf": str(path.parent / arm["urdf"])}}

@@ -284,7 +284,7 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is spatial: [arm] urdf is given, and its arm is not planar or [joint_path] is given."""
+        """Whether the arm is spatial: [arm] urdf is given, and [joint_path] is given or that arm is not planar."""
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property

@@ -1,1 +1,1 @@
-"""Descriptions of an arm's mechanism, read from URDF and MJCF files. Imports nothing else from hil."""
+"""Descriptions of an arm's mechanism, read from URDF and MJCF files. This package imports nothing else from hil."""

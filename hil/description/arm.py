@@ -115,7 +115,7 @@ class ArmDescription:
     doubts: tuple[str, ...]
     """Warnings about implausible inertias and physics that is not modelled, one sentence each."""
     gravity: tuple[float, float, float] | None = None
-    """Gravity in the base's frame as given in the file [m/s^2]; None if the file gives none or the format's default."""
+    """Gravity in the base's frame as given in the file [m/s^2]; None if it is not given or is the format's default."""
 
     @property
     def parameters(self) -> Array:

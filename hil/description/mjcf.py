@@ -246,7 +246,7 @@ class _Tree:
 
     def rigid(self, body: int, chosen: set[int]) -> tuple[Body, list[str], list[str]]:
         """Merge a body with everything fixed to it, in the frame of its joint. Also returns the names of the merged
-        bodies and of the joints held.
+        bodies and of held joints.
         """
         merged, fixed, held = self._merged(body, chosen)
         return merged.moved(np.eye(3), -self._pivot(body)), fixed, held

@@ -38,8 +38,8 @@ def _first_link(arm: ArmDescription, offsets: list[Array]) -> Array:
 
 
 def _level(axis: Array, link: Array, down: Array) -> bool:
-    """Whether the component of `link` normal to `axis` is also normal to `down`, and positive rotation about the axis
-    lifts it.
+    """Whether the part of `link` perpendicular to `axis` is also perpendicular to `down` and is lifted by positive
+    rotation.
     """
     across = link - axis * float(axis @ link)
     length = float(np.linalg.norm(across))

@@ -201,7 +201,7 @@ def _reached(config: Config, prediction: Prediction, share: float) -> Array:
 
 
 def _too_many(config: Config, plan: Plan, few: Ensemble, share: float, pose: Array | None, count: int) -> bool:
-    """Whether more of the arms in `few` exceed `share` of a limit than is allowed among `count` arms."""
+    """Whether more of the arms in `few` exceed `share` of a limit than are allowed among `count` arms."""
     if not few.size:
         return False
     passed = _passed(predict(config, plan, few, pose=pose), share)

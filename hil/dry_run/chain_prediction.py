@@ -65,8 +65,8 @@ def predict_chain(
 ) -> ChainPrediction:
     """Simulate `plan` on every arm. Raises ArmFileError, ConfigError.
 
-    tell: called with the number of simulations done and the total number. shown: number of motions to store. passed:
-    whether each joint has ever been below and above its rest pose (2, joints), as for `resting_stops`.
+    tell: called with the number of simulations done and the total. shown: number of motions to store. passed: whether
+    each joint has ever been below and above its rest pose (2, joints), as for `resting_stops`.
     """
     space = Space.of(config)
     limits, rest = limits_of(config), np.array(config.arm.rest_pose)

@@ -32,8 +32,8 @@ class Fall:
     """The hardest of the simulated falls.
 
     moment: time in the path at which it starts [s]. hits: names of the colliding parts; None if nothing collides within
-    FALL_S. seconds: duration [s]. height: largest descent [m]. speed: largest speed at its end [m/s]. beyond: largest
-    overshoot of each joint beyond its limits in any fall (joints,) [rad].
+    FALL_S. seconds: duration [s]. height: largest descent [m]. speed: largest speed at the end of the fall [m/s].
+    beyond: largest overshoot of each joint beyond its limits in any fall (joints,) [rad].
     """
 
     moment: float
@@ -95,8 +95,8 @@ def foreseen_stops(
 ) -> ChainStops:
     """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError.
 
-    tell: called with the number of simulations done and the total number. passed: whether each joint has ever been
-    below and above its rest pose (2, joints), as for `resting_stops`.
+    tell: called with the number of simulations done and the total. passed: whether each joint has ever been below and
+    above its rest pose (2, joints), as for `resting_stops`.
     """
     segment = plan.segments[0]
     assert isinstance(segment, PathSegment)

@@ -1,8 +1,8 @@
 """Simulate the experiment on an ensemble of arms, and compare the predicted peaks with each limit.
 
-Every arm receives the goal currents of the plan, ramps included and rounded to the servos' ticks, for as many periods
-as it takes to settle. If a peak reaches 1 as a fraction of the distance from rest to the limit, the guard would have
-stopped that arm.
+Every arm receives the plan's goal currents, including the ramps, rounded to the servos' ticks, for as many periods as
+it takes to settle. Peaks are fractions of the distance from rest to the limit; the guard would have stopped an arm
+whose peak reaches 1.
 """
 
 from collections.abc import Sequence
@@ -101,7 +101,7 @@ class Prediction:
         return origin
 
     def _middle(self) -> tuple[Array, Array]:
-        """Medians of the shares and their spread above the median (quantities, joints); peaks are skewed towards the
+        """Medians of the shares, and spreads above the medians (quantities, joints); peaks are skewed towards the
         limit.
         """
         middle = np.median(self.shares, axis=0)

@@ -30,7 +30,7 @@ def resting_stops(config: Config, arms: ChainArms, planned: Sequence[Array] = ()
 
     A joint is assumed to lie on its stop if its rest pose is near the end of its range, nothing else touches the part
     of the arm that it moves, and gravity does not pull it away from there. This assumption is dropped if a recording
-    shows the joint beyond its rest pose, or a planned path takes it there, within its configured limits. planned:
+    shows the joint beyond its rest pose, or if a planned path takes it there, within its configured limits. planned:
     positions of these paths, each (joints, samples) [rad]. passed: whether each joint has been below and above its rest
     pose, as returned by `passed_rest` (2, joints). Raises ArmFileError.
     """

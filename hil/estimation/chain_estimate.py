@@ -1,4 +1,4 @@
-"""Estimate the result of a spatial arm from its run folder in two stages, and validate it on a held-out path."""
+"""Estimate a spatial arm's parameters from its run folder in two stages, and validate them on a held-out path."""
 
 import time
 from contextlib import suppress

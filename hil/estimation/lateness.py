@@ -27,8 +27,8 @@ def lateness(rows: NDArray[np.void]) -> Array:
 def acting_torque(goals: Array, late: Array, rate: float) -> Array:
     """Mean torque between deadlines (joints, samples) [N m].
 
-    goals: held torques (joints, samples + 1) [N m], starting with the one before the period. late: lateness of all but
-    the first of them (samples,) [s]. rate: samples per second [Hz].
+    goals: held torques (joints, samples + 1) [N m], starting with the one before the period. late: lateness of all
+    goals but the first (samples,) [s]. rate: samples per second [Hz].
     """
     before = np.clip(late * rate, 0.0, 1.0)
     mean: Array = goals[:, 1:] + (goals[:, :-1] - goals[:, 1:]) * before

@@ -36,7 +36,7 @@ def doubts(
 
 
 def wrong_length(length: float | None, gravity: float, estimate: Estimate | ShootingEstimate) -> list[str]:
-    """Check coupling * gravity / gravity_2, which should equal the measured `length` of link 1 [m], if it is known.
+    """If the `length` of link 1 [m] is known, check that coupling * gravity / gravity_2 equals it.
 
     gravity: gravity in the arm's plane [m/s^2].
     """
@@ -79,7 +79,7 @@ def _weight(config: Config, estimate: Estimate, largest_torque: float) -> list[s
 
 
 def _hangs_upwards(config: Config, joint: int) -> bool:
-    """Whether a link points up in its rest pose, unsupported, so that its centre of mass must lie below its joint."""
+    """Whether a link rests pointing up without support, which implies that its centre of mass lies below its joint."""
     angle = float(np.sum(config.arm.rest_pose[: joint + 1]))
     return config.stabiliser is None and np.sin(angle) > _UPRIGHT
 

@@ -98,7 +98,7 @@ def _parameters(result: SettledResult, truth: Truth) -> Table:
 
 
 def _shown(entry: Quantity) -> list[str]:
-    """Return value and standard error; "undetermined" and "-" if the motion provides no information about the value."""
+    """Return the value and its standard error; "undetermined" and "-" if the motion does not determine the value."""
     return [f"{entry.value:.5g}", f"{entry.std:.1e}"] if entry.std < math.inf else ["undetermined", "-"]
 
 

@@ -55,8 +55,8 @@ class Change:
 class Difference:
     """The changes from one run to another.
 
-    only_before, only_after: terms that only one of the two models has. detectable: smallest change of each friction
-    term alone that two such runs would reveal with a probability of 95 % [% of its earlier value].
+    only_before, only_after: terms that only one of the two models has. detectable: for each friction term, the smallest
+    change that two such runs would reveal with a probability of 95 % if no other term changed [% of its earlier value].
     """
 
     before: str

@@ -98,7 +98,7 @@ def _of_joint(
 
 
 def _comparable(models: Sequence[ArmModel], name: str) -> bool:
-    """Whether both models have the term, or one has it and its absence from the other means 0."""
+    """Whether both models have the term, or one has it and the other implies that it is 0."""
     having = [name in model.values for model in models]
     return all(having) or (any(having) and TERMS[name.rpartition("_")[0]].absent == 0.0 and "velocity" not in name)
 

@@ -91,9 +91,7 @@ def _compare_chain(run: RunFolder, config: str, mujoco: bool) -> Comparison:
 
 
 def truth_for(peer: Peer, truth: Mapping[str, float] | None, config: Config) -> Mapping[str, float] | None:
-    """Return the true parameters, scaled to the torque constants that a method's result assumes, as for `hil
-    identify`.
-    """
+    """Return the true parameters, scaled to the torque constants that a method's result assumes."""
     return None if truth is None else in_file_unit(truth, config, peer.parameters, len(config.joints)).values
 
 
@@ -147,7 +145,8 @@ def _entry(peer: Peer, held_out: float | None, name: str | None, worst: float | 
 def worst_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
     """Return the inertia, gravity or friction parameter with the largest relative error, and that error.
 
-    Offsets, near zero, are left out. A parameter that the method does not estimate counts as 0, a relative error of 1.
+    Offsets are left out because they are near zero. A parameter that the method does not estimate counts as 0, so its
+    relative error is 1.
     """
     errors = {
         name: abs(parameters.get(name, 0.0) / true - 1.0)

@@ -98,10 +98,10 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
 
 
 def _noise(goal: Array, measured: Array) -> float:
-    """Standard deviation of a current reading, estimated from the recording: its scatter at constant goals or, if
-    larger, its deviation from the goals or (if smaller) the second difference of that deviation.
+    """Standard deviation of a current reading, estimated from the recording as the larger of two values: its scatter at
+    constant goals, and its deviation from the goals or, if smaller, the second difference of that deviation.
 
-    The current may lag the goal by a few samples: the lag that leaves the smallest deviation is used.
+    Since the current may lag the goal by a few samples, the lag that leaves the smallest deviation is used.
     """
     count = len(goal) - _RECENT
     if count < _RECENT:
@@ -170,7 +170,7 @@ def _least(goal: Array) -> Array:
 
 
 def _short_part(goal: Array, measured: Array, margin: float) -> float:
-    """Among the samples with large goals, the fraction whose current is too small."""
+    """Fraction of the samples with large goals whose current is too small."""
     least = _least(goal)
     large = (least > LARGE * np.abs(goal).max()) & np.isfinite(measured[1:])
     if not large.any():

@@ -5,7 +5,7 @@ if it is driven with current i. The resistance of the supply turns this current 
 read only a few times a second, in steps of 0.1 V; a regression of its readings on these products gives the drop at
 every sample.
 
-A voltage-driven joint receives its duty cycle times the supply voltage at that moment: its torque sags with it. A
+A voltage-driven joint receives its duty cycle times the supply voltage at that moment, so its torque sags as well. A
 current-driven joint is not affected as long as its servo can still drive the current.
 """
 
