@@ -1,4 +1,4 @@
-"""Warnings about a recording that do not prevent the estimation, each with the joint and a remedy."""
+"""Warnings about a recording that can still be used for an estimate; each names the joint and a remedy."""
 
 import numpy as np
 from numpy.typing import NDArray

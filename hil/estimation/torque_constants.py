@@ -94,7 +94,7 @@ def contradictions(
 
     joints: names. extra: terms of a result that include the ratios, if there are any. ratio_std: relative standard
     deviation of the ratio of the torque constants, by parameter; where it is not given, the spread among servos of one
-    model is assumed. known: contradictions that have their own sentences.
+    model is assumed. known: contradictions that are already reported.
     """
     said = {each.name for each in known}
     found = []

@@ -91,7 +91,7 @@ def scaled(truth: Mapping[str, float] | None, config: Config, extra: Mapping[str
 
 
 def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str], joints: int) -> Truth:
-    """True values scaled to the file's torque constants, as in a result with parameters of these names."""
+    """True values scaled to the file's torque constants. names: names of the result's parameters."""
     ratios, has_ratios = _torque_ratios(config), any(kind_of(each) == RATIO for each in names)
     if not truth or all(abs(ratio - 1.0) <= _EQUAL for ratio in ratios):
         return Truth(dict(truth), "")

@@ -134,7 +134,7 @@ class Guard:
         self._silence.woke_up(now, late)
 
     def others_answer(self) -> None:
-        """Record that some servos that are not heard do answer: a silent one hides their replies."""
+        """Record that some unheard servos do answer, but a silent one hides their replies."""
         self._silence.others_answer = True
 
     def late(self, seconds: float = 0.0) -> None:
@@ -232,8 +232,8 @@ class Guard:
         self._stop(index, *TORQUE_LOST)
 
     def rests_at(self, positions: Sequence[float]) -> None:
-        """Set the joints' angles before torque was switched on [rad]; by default, those of the first sample are used.
-        From now on, `measure_noise` is called with each exchange until `noise_is_known`.
+        """Store the angles that the joints had before torque was switched on [rad]; by default, those of the first
+        sample are used. From now on, `measure_noise` is called with each exchange until `noise_is_known`.
         """
         self._resting = positions
         self._noise.begin()

@@ -51,11 +51,11 @@ _INERTIA = 0.3
 """Standard deviations for an arm without a description, as multiples of the planned torque in SI units.
 
 Gravity may be ten times as large as a small first torque, which then moves the arm by a tenth of a radian. But viscous
-friction and inertia cannot be several times as large as the planned torque, because the arm would then hardly move. If
-the excitation is slower than `_USUAL_HZ`, they can, proportionally: long, heavy arms are excited slowly.
+friction and inertia cannot be several times as large as the planned torque, because the arm would then hardly move. For
+an excitation slower than `_USUAL_HZ`, their values are raised in proportion: long, heavy arms are excited slowly.
 """
 _USUAL_HZ = 0.7
-"""Geometric mean of the lowest and highest frequencies below which the excitation counts as slow."""
+"""An excitation counts as slow if the geometric mean of its lowest and highest frequencies is below this."""
 _FLAT = 0.3
 """Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the units of `_INERTIA`."""
 _NEAR_LIMIT = 0.05
@@ -96,16 +96,16 @@ JOLT = np.dtype(
 )
 """Statistics of a joint's changes of velocity; initially zero, except `begun`, which is minus infinity.
 
-square: mean square of ordinary changes [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may
-still turn out to belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s]. begun: time
-of that change [s]. count, oldest: number of earlier velocities stored, and the row of the oldest. reversed: whether the
-joint reversed in the first change of a possible jolt.
+square: mean square of ordinary changes [rad^2/s^2], over age [s]. squared, since: integral of the squared changes not
+yet included, because they may belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s].
+begun: time of that change [s]. count, oldest: number of earlier velocities stored, and the row of the oldest. reversed:
+whether the joint reversed in the first change of a possible jolt.
 """
 
 
 def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float, least: float) -> int:
     """Process velocities [rad/s], `seconds` after the previous ones [s]; return a joint whose velocity jumped and
-    returned a moment later, as when its horn slips, or -1.
+    jumped back a moment later, as when its horn slips; -1 if there is none.
 
     No motor can do this on any arm: it would have to accelerate and brake much harder than ever before. The check
     therefore needs no knowledge of the arm. Changes of velocity over `JOLT_S` are compared with ordinary ones.
@@ -165,8 +165,8 @@ that counts as a jolt [rad/s].
 """
 
 _DRIVE = np.dtype([(name, "f8") for name in ("constant", "goal", "felt")])
-"""A joint's torque: the constant [N m/A or N m/V], the latest goal [A or V], NaN before the first one, and the torque
-that the motor has reached [N m].
+"""A joint's torque: the constant [N m/A or N m/V], the latest goal [A or V] (NaN before the first one), and the
+torque that the motor has reached [N m].
 """
 
 

@@ -28,8 +28,8 @@ FLOOR_RAD = 0.05
 
 LASTING_S = 0.03
 UNJUDGED_S, _MOST_UNJUDGED = 0.2, 0.25
-"""Time at the end of a period that does not affect the tolerance in the next one [s], and its largest fraction of a
-period.
+"""Time at the end of a period that does not affect the tolerance in the next one [s], and its upper bound, as a
+fraction of the period.
 """
 
 _FEWEST = 2  # samples, however low the rate

@@ -1,5 +1,5 @@
-"""Links for the export of an identified spatial arm: among all physically possible links with the identified
-dynamics, those closest to the URDF.
+"""Links for the export of an identified spatial arm: of all physically possible links with the identified dynamics,
+the ones closest to the URDF are used.
 """
 
 from collections.abc import Mapping

@@ -133,7 +133,7 @@ class ChainSearch(SafeShares):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
-        """Play a run and set `last` to its share of the amplitude; return the error that ended it early, or None.
+        """Play a run and set `last` to its fraction of the amplitude; return the error that ended it early, or None.
 
         Only errors that are informative about the arm are returned; all others are raised.
         """

@@ -1,4 +1,5 @@
-"""The largest share of the designed paths' amplitude that is safe for every spatial arm of the current belief.
+"""The largest fraction ("share") of the designed paths' amplitude that is safe for every spatial arm of the current
+belief.
 
 `hil identify` and `hil dry-run` both use this search, on the same arms, so that they agree.
 """
@@ -40,7 +41,7 @@ OTHER_SEEDS = 2
 _NEXT_SEED = 100
 
 MOST_SIMULATED_S = 60_000.0
-"""A search tries no further paths after it has simulated this much motion [s], over all arms: about a minute of
+"""A search tries no further paths after it has simulated this much motion [s], summed over all arms: about a minute of
 processor time with six joints.
 """
 
@@ -261,7 +262,7 @@ class SafeShares:
         return Found(share, plan, foreseen), why, -float(foreseen.rooms.min())
 
     def _worth(self, paths: Paths, found: Found) -> float:
-        """Worst relative standard error of the base parameters with the found share of a path."""
+        """Worst relative standard error of the base parameters with the share found for a path."""
         return paths.designer.worth(paths.designer.scaled(paths.identify, found.share))[0]
 
     def _unsafe_stop(self, config: Config, plan: Plan) -> str:

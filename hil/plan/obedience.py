@@ -3,8 +3,9 @@
 While the torque is constant, a reversed motor cannot be distinguished from an external push: either way, the arm moves
 as if an additional torque acted on the joint. The goal of a suspect joint is therefore removed briefly, while the other
 goals are held. Unexplained torque that comes from the joint's own motor then falls in proportion to the motor's torque,
-through the same filter; torque from a push does not. If it falls earlier or later than that, the joint is tested again.
-The test is so short that an unpowered joint gains less speed from gravity than a reversed motor would give it.
+through the same filter; torque from a push does not. If the unexplained torque falls earlier or later, the joint is
+tested again. The test is so short that an unpowered joint gains less speed from gravity than a reversed motor would
+give it.
 """
 
 from collections.abc import Sequence

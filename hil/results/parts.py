@@ -324,7 +324,7 @@ class StabiliserShare:
         return tuple(rms / max(whole, 1e-12) for rms, whole in zip(self.rms, self.commanded_rms, strict=True))
 
     def said(self, names: Sequence[str]) -> str:
-        """A sentence about the stabiliser's share of the torque, with these joint names."""
+        """A sentence about the stabiliser's contribution to the torque, with these joint names."""
         each = ", ".join(
             f"{name} {rms:.3f} of {whole:.3f} N m RMS ({100 * part:.0f} %, peak {peak:.3f})"
             for name, rms, whole, part, peak in zip(

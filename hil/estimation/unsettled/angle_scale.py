@@ -54,7 +54,7 @@ def angle_scale(
 def _candidate(recordings: Sequence[Recording], estimate: ShootingEstimate, about: Array) -> _Scale | None:
     """The scale of the first joint that would imitate the spring of the estimate.
 
-    Scales of other joints change the effect of these joints on the first one, which no spring can imitate.
+    No spring can imitate a wrong scale of another joint, which changes that joint's effect on the first one.
     """
     value, names = estimate.parameters, list(estimate.names)
     if SPRING not in names or not value["gravity_1"] > 0.0:

@@ -143,7 +143,7 @@ def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescripti
 def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior, contradictory: bool) -> RecordedChain:
     """The fit. contradictory: whether the torques seem to contradict each other.
 
-    If so, their ratios are fitted too, unless the fit finds that the torques agree; a regression does not fit ratios.
+    If so, and if torques are held between samples, their ratios are fitted too, but dropped if the torques then agree.
     """
     if contradictory and all(each.between == "held" for each in recordings):
         found = identify_recordings(recordings, replace(model, torque_scale=True), prior)

@@ -1,6 +1,6 @@
-"""Location and kind of the parts of a recording that the fitted model fails to explain, unlike the rest.
+"""Locate and classify the parts of a recording that the fitted model explains much worse than the rest.
 
-These are frozen readings, missing torques, single wrong samples, and stops.
+The kinds are frozen readings, missing torques, single wrong samples, and stops.
 """
 
 from collections.abc import Iterator, Sequence

@@ -73,9 +73,10 @@ class CurrentNoise:
 
 @dataclass(frozen=True)
 class Noisy:
-    """A joint whose current reading is noisier than usual; `said` reports this and its consequence.
+    """A joint whose current reading is noisier than usual.
 
-    refused: why the joint cannot be monitored, and what to do; "" if it can.
+    said: the noise and its consequence, as text. refused: why the joint cannot be monitored, and what to do; "" if it
+    can.
     """
 
     index: int

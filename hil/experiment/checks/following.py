@@ -14,13 +14,13 @@ goals, because a reply may be measured before or after the motor follows the lat
 error of `GAIN_ERROR`.
 
 Successive errors may be correlated, so each sample is weighted by the time that it represents. The unweighted sum must
-also reach h = `LEAST_RATIO`, which a healthy motor's sum does with a probability of at most exp(-h) after any given
-check.
+also reach h = `LEAST_RATIO`. From any given check on, a healthy motor's sum does so with a probability of at most
+exp(-h).
 
-While a joint stands still, its readings may also freeze at the commanded current, and the goal may take seconds to get
-far from it. But a motor's current follows its goal: if the readings of position, velocity and current all stay exactly
-the same although the goals that they may reflect (those of the last `ANSWERS_S`) have changed, they are frozen. A
-constant sensor error cancels in this comparison.
+While a joint stands still, its readings may also freeze at the commanded current, from which the goal may take seconds
+to move far away. But a motor's current follows its goal: if the readings of position, velocity and current all stay
+exactly the same although the goals that they may reflect (those of the last `ANSWERS_S`) have changed, they are frozen.
+A constant sensor error cancels in this comparison.
 
 A current sensor may be noisier than assumed. Its noise is measured at constant goals, while the arm rests before the
 start (`current_noise`), and is a lower bound of sigma: a noisy reading then means that lost torque is found later, not
@@ -85,8 +85,8 @@ GOALS = np.dtype(
 
 most: largest change of the goal under which all readings may stay the same [A or V]. carried, same_for: current, and
 how long all readings have been the same [s]. age: age of the latest block [s]. low, high: smallest and largest goal in
-each block, the latest first. lowest, highest: the smallest upper and the largest lower end of the range of goals that
-one of these readings may reflect.
+each block, the latest first. lowest, highest: smallest upper end and largest lower end of the ranges of goals
+that the readings since then may reflect.
 """
 
 MEMORY = np.dtype(

@@ -218,7 +218,7 @@ def _is_stuck(readings: Sequence[tuple[float, float]], least: float) -> bool:
 
 
 def _is_shifted(readings: Sequence[tuple[float, float]], least: float) -> bool:
-    """Whether a current follows its goal, which has changed by more than `least`, but with an offset."""
+    """Whether a current follows its goal with an offset; offset and goal change must both exceed `least`."""
     if len(readings) < _FEWEST:
         return False
     goals = [goal for goal, _ in readings]

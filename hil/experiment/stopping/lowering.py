@@ -260,7 +260,7 @@ class Lowering:
         )
 
     def others_answer(self) -> None:
-        """Record that some servos that are not heard do answer: a silent one hides their replies."""
+        """Record that some unheard servos do answer, but a silent one hides their replies."""
         self._guard.others_answer()
 
     def late(self, seconds: float) -> None:

@@ -29,7 +29,8 @@ LEAST_INFORMATION = 0.1
 """Smallest integral of the squared change of velocity, excluding what a scale error explains [rad^2/s]."""
 
 ENOUGH_INFORMATION, ALL_INFORMATION = 0.3, 3.0
-"""Integrals as in `LEAST_INFORMATION`, over the whole run, at which lag and scale error become known, and are frozen.
+"""Integrals as in `LEAST_INFORMATION`, over the whole run: from the first on, lag and scale error count as known; from
+the second on, they are no longer updated.
 """
 
 SEPARATE = 0.05
