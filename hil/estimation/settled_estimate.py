@@ -154,8 +154,8 @@ def _torque_instead(other: SettledPeriod | None, estimate: Estimate, drift: Drif
 
 
 def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift | None, is_corrected: bool) -> PlayedPeriod:
-    """Predict the held-out period with the friction at that time. is_corrected: whether to correct the prediction for
-    friction that changes within the period, as was done for the fitted period.
+    """Predict the held-out period with the friction that the arm had then. is_corrected: whether to correct the
+    prediction for friction that changes within the period, as for the fitted period.
     """
     if drift is None:
         return PlayedPeriod(other.rate, other.torque, other.position, predict_period(estimate, other))

@@ -14,7 +14,7 @@ RATIO = "torque_scale"
 USUAL_RATIO_STD = math.hypot(USUAL_TORQUE_SPREAD, USUAL_TORQUE_SPREAD)
 CONTRADICTORY = 2.0  # standard deviations, those of the torque constants and of the ratio combined
 COLUMNS_APART = 1.0
-"""Relative standard deviation assumed for the ratio of two torque columns, because the scale of neither is known."""
+"""Relative standard deviation assumed for the ratio of two torque columns, whose scales are unknown."""
 Source = Literal["constant", "column"]
 """Where a joint's torque comes from: its torque constant, or a column of a recording."""
 _STATES: dict[Source, str] = {"constant": "torque constants", "column": "torque columns"}

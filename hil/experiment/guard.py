@@ -36,7 +36,7 @@ from hil.plan.recent_motion import RecentMotion
 __all__ = ["MOST_OUTSIDE_RAD", "Guard"]
 
 JUMP_FACTOR = 1.5
-"""Distance that a joint may appear to move between two samples, relative to the one its velocity limit allows."""
+"""Distance that a joint may appear to move between two samples, relative to what its velocity limit allows."""
 
 EARLY_MOTION_RAD = 0.05
 """Largest motion allowed while the arm rests before the start [rad]."""
@@ -239,7 +239,7 @@ class Guard:
         self._noise.begin()
 
     def measure_noise(self, state: State) -> None:
-        """Process an exchange of an arm at rest: until its noise is known, any deviation of a current reading is
+        """Process an exchange of an arm at rest: until the noise is known, any deviation of a current reading is
         accepted.
         """
         self._noise.add(state)

@@ -69,11 +69,11 @@ _LAG_S = 0.012
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 JOLT_S, JOLT_BACK_S = 0.01, 0.15
-"""Times within which a slipping joint's velocity changes, and returns [s]."""
+"""Times within which a slipping joint's velocity changes, and changes back [s]."""
 
 JOLT_RAD_S, JOLT_TIMES = 1.2, 5.0
 """Smallest change of velocity in `JOLT_S` that counts as a jolt [rad/s], and its smallest ratio to the RMS of ordinary
-ones.
+changes.
 """
 
 PLAY_RAD, CURVED = 0.015, 0.2
@@ -158,8 +158,8 @@ _TIMES = np.dtype(
 """Quantities that depend on the times of the samples.
 
 seen_at, seconds: time of the latest sample, and time since the previous one [s]; seconds is infinite if the motion in
-between is not judged. shortest: duration of the shortest exchange [s]. vague: largest excess over it at which the time
-of a measurement counts as known [s]. longest_gap: largest `seconds` over which changes of velocity are judged [s].
+between is not judged. shortest: duration of the shortest exchange [s]. vague: largest excess over this at which the
+time of a measurement counts as known [s]. longest_gap: largest `seconds` over which changes of velocity are judged [s].
 follows: fraction of a torque step that the motor has followed by the next sample. least: smallest change of velocity
 that counts as a jolt [rad/s].
 """

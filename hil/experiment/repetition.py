@@ -49,10 +49,10 @@ _SUMS = np.dtype(
 )
 """Running sums of one joint.
 
-lowest, highest: range of its positions [rad]. first: first position compared, which is subtracted from the others to
-avoid cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of
-squares and number of changes from the previous period. early_squared, early_pairs: the same for the first half of the
-period. sure_squared, sure_pairs: the same for the second half without its end.
+lowest, highest: range of its positions [rad]. first: first position in the second half of the period. sum,
+sum_of_squares, seen: sum, sum of squares and number of the positions in that half, relative to `first` to avoid
+cancellation. squared, pairs: sum of squares and number of their changes from the previous period. early_squared,
+early_pairs: the same for the first half. sure_squared, sure_pairs: the same for the second half without its end.
 """
 
 

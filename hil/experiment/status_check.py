@@ -192,7 +192,7 @@ class StatusCheck:
         return 0
 
     def why_lost(self) -> str:
-        """Return why goals are lost, for example to unexpected bytes on the wire."""
+        """Return why goals are lost, for example because of unexpected bytes on the wire."""
         refused = (
             "Goals are being lost in transit, the servo refuses them (check its cable and limits), or a device on the "
             "bus repeats its old replies."
@@ -257,7 +257,7 @@ class StatusCheck:
 
 
 def _unlike_armed(longer: int) -> str:
-    """What a changed watchdog timeout means; longer: its increase [20 ms], 0 if it is off."""
+    """What a changed watchdog timeout means; longer: its increase [20 ms], 0 if the watchdog is off."""
     if not longer:
         return "is no longer protected"
     return f"stops by itself {'later' if longer > 0 else 'earlier'} than intended"

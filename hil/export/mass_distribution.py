@@ -89,8 +89,8 @@ def _share_of_rod(p: Mapping[str, float]) -> float:
 
 
 def _link(moment: float, about_joint: float, share: float, farthest: float) -> LinkMass:
-    """A link with first moment m c and second moment J + m c^2 about its joint; m c^2 is `share` of the latter if
-    possible.
+    """A link with first moment m c and second moment J + m c^2 about its joint; if possible, m c^2 is `share` times the
+    second moment.
     """
     if moment == 0:
         length = farthest if math.isfinite(farthest) else _UNKNOWN_LENGTH

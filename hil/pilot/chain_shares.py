@@ -49,7 +49,7 @@ STOPPED_SHARE = 0.5
 """Computing time of a simulated stop, relative to that of one arm on a path and its transitions."""
 
 RAISED_RATE = 1.6
-"""First higher rate tried in the search for one to recommend, relative to the configured rate."""
+"""First rate tried when searching for a higher one to recommend, relative to the configured rate."""
 
 ROOM = 1.2
 """Recommended extension of a limit, relative to the amount by which the simulated arms exceed the limit."""

@@ -338,7 +338,7 @@ class StabiliserShare:
 class PlayedStep:
     """One step of a pilot on the way to full amplitude, with its predicted and measured peaks.
 
-    The rows of predicted and measured peaks are the quantities of hil.dry_run.prediction.QUANTITIES, the columns are
+    The rows of predicted and measured peaks are the quantities of hil.dry_run.prediction.QUANTITIES; the columns are
     the joints. peak_torque: peak torque per joint [N m]. ended: why the run ended early; None if it did not.
     """
 

@@ -62,8 +62,8 @@ _AT_A_LIMIT = frozenset({Cause.POSITION, Cause.VELOCITY})
 """Causes of a stop that excessive torque by itself can explain."""
 
 _MODES_SEEN_S = 0.06
-"""If the operating modes were read back less than this time [s] before a stop, a changed mode may have been changed
-after the stop.
+"""If the operating modes were read back less than this time [s] before a stop, a mode that differs may have been
+changed after the stop.
 """
 
 Settings = Mapping[tuple[Joint, str], int]

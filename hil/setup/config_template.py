@@ -144,7 +144,7 @@ def _joint(answers: JointAnswers) -> list[str]:
 
 
 def _spread(published: Published) -> float:
-    """Standard deviation of a published constant: half the range of published values, at least a tenth of the value."""
+    """Standard deviation of a published constant: half the published range, but at least a tenth of the value."""
     return max(0.1 * published.value, (published.high - published.low) / 2)
 
 

@@ -3,7 +3,8 @@
 A joint's equation is linear in its angle except for gravity, so only gravity reveals the scale. Near the angle at which
 the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, a weaker gravity and a spring: with a
 spring, an offset and an encoder zero, a fit explains angles with a wrong scale s down to the noise, but with wrong
-values. So if a fit finds a spring, the motion is fitted again without it, but with the scale that would imitate it.
+values. So if a fit finds a spring, the motion is fitted again without a spring but with the scale that would imitate
+one.
 """
 
 import math
@@ -112,7 +113,7 @@ def _fitted(
 
 
 def _scaled(recordings: Sequence[Recording], factor: Array, about: Array) -> list[Recording]:
-    """The recordings with angles relative to `about` (joints,) [rad] divided by `factor` (joints,)."""
+    """The recordings, in which each angle relative to `about` (joints,) [rad] is divided by `factor` (joints,)."""
     centre = about[:, None]
     return [
         replace(

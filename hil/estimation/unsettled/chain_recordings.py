@@ -51,7 +51,7 @@ class ChainEstimated:
 def estimate_chain_recordings(
     recordings: Sequence[Recording], config: RecordingConfig, shown_path: str, source: str
 ) -> ChainEstimated:
-    """Estimate a spatial arm from recordings. source: their files, for messages.
+    """Estimate a spatial arm from recordings. source: names their files in messages.
 
     Raises ConfigError, CsvError, ArmFileError, EstimationError.
     """
@@ -114,7 +114,7 @@ def estimate_chain_recordings(
 
 
 def _drive(config: RecordingConfig, joints: int) -> Drive:
-    """The drive model of the file; by default, for several joints, a common delay and a separate lag for each.
+    """The configured drive model; by default, for several joints, a common delay and a separate lag for each.
 
     Other tools' recordings may contain both, and a delay does not explain lags that differ between joints.
     """

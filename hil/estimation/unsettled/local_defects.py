@@ -53,8 +53,8 @@ def local_defects(
 ) -> tuple[str, ...]:
     """One sentence for each local defect, for a fit that leaves much of the motion unexplained.
 
-    predicted: simulated positions of each recording (joints, samples) [rad]. window: length over which residuals are
-    compared [s].
+    predicted: simulated positions of each recording (joints, samples) [rad]. window: length of the parts whose
+    residuals are compared [s].
     """
     joints = list(_joints(recordings, names, predicted, window))
     return tuple(

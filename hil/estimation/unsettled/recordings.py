@@ -135,7 +135,7 @@ def _doubted(result: ShootingResult, read: Converted) -> ShootingResult:
 
 
 def _zeroed(read: Converted, gravity: float) -> Converted:
-    """Measure angles from the horizontal, if their origin is not given but can be determined from gravity."""
+    """Measure angles from the horizontal if their origin is not given but can be determined from gravity."""
     if gravity <= 0.0 or read.columns.zero is not None:
         return read
     zeros = turned_zeros(read.recordings)

@@ -17,14 +17,14 @@ from hil.estimator.baselines.signs import (
 from hil.estimator.data.recording import Recording
 
 CLEAR = 0.25
-"""A mistake is clear only if its correction reduces the torque residual to less than this fraction of its value."""
+"""A mistake is clear only if correcting it reduces the torque residual to less than this fraction."""
 
 NEARLY_ALL = 0.9  # fraction of the segments
 STUCK_STEPS = 10.0  # motion in encoder steps below which a joint sticks
 SAME_ANGLE = 0.01  # rad
 
 WELL = 0.3
-"""A mistake is clear only if the torque residual after its correction is less than this fraction of the RMS torque."""
+"""A mistake is clear only if correcting it leaves a torque residual of less than this fraction of the RMS torque."""
 
 
 def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None = None) -> None:

@@ -6,12 +6,12 @@ velocity must equal the change in position. The difference,
     apart = position - integral of velocity,
 
 is tracked with three fading memories (leaky integrators): a short one, which reveals a sudden fault at once; a long
-one, which reveals a gradual fault; and a slow one, which reveals creep. Rounding of positions and encoder noise do not
+one, which reveals a gradual fault; and a slow one, which reveals creep. Encoder noise and rounding of positions do not
 accumulate in this difference. The contributions of a healthy servo are known:
 
 - a velocity that lags by tau, because the servo filters it: tau times (velocity minus its mean over the memory). Any
   lag up to `LAG_S` is accepted;
-- a velocity with a scale error: that fraction of the distance covered within the memory, at most `SCALE`;
+- a velocity with a scale error: the same fraction of the distance covered within the memory, at most `SCALE`;
 - a velocity that is rounded towards zero, or always downwards (which of the two a servo does is unknown). In the slow
   memory, this adds one register step times the excess of time in one direction over the other, or a bias of up to half
   a step times the time in motion, unless the motion so far rules it out (`hil.experiment.velocity.bias`). While the

@@ -1,4 +1,4 @@
-"""Noise of the current readings, measured while the arm rests, and what it means for the check of the current.
+"""Noise of the current readings, measured while the arm rests, and its effect on the check of the current.
 
 The thresholds of `following` assume no more noise than usual. A noisier sensor gets wider thresholds, so that a healthy
 motor is not stopped.
@@ -20,7 +20,7 @@ from hil.experiment.checks import following
 __all__ = ["CurrentNoise", "NoiseAllowance", "Noisy"]
 
 FEWEST_READINGS, MOST_READINGS = 8, 256
-"""Number of readings from which noise is first measured, and number of the latest ones that are kept."""
+"""Number of readings from which noise is first measured, and number of latest readings that are kept."""
 
 _UNCERTAIN = 1.9
 """Largest underestimate of noise measured from n readings, relative to the true noise, times sqrt(n)."""

@@ -55,7 +55,7 @@ LOST_AFTER_S = 0.03
 """Time for which a current must look like zero, at full weight, before it counts as zero [s]."""
 
 _FULL_WEIGHT = 5.0
-"""Upper bound on the log likelihood ratio of one sample: that of a goal of four sigma if zero is measured."""
+"""Upper bound on the log likelihood ratio of one sample: its value if zero is measured at a goal of four sigma."""
 
 LEAST_RATIO = 10.0
 """Log likelihood ratio at which a current counts as zero, however low the rate."""

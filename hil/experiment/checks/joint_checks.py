@@ -1,6 +1,6 @@
 """Checks of every joint in every exchange, in one compiled loop because there is little time between samples.
 
-They are, in this order: a jump of the position, the limits of position and velocity, whether the motor carries the
+They check, in this order: jumps of the position, the limits of position and velocity, whether the motor carries the
 commanded current (`following`), whether position and velocity agree (`consistency`), whether the motor turns as
 commanded (`work`), and whether all readings are frozen although the goal changes (`following` again). Everything known
 about a joint is in one record of the type `JOINT`.

@@ -21,13 +21,13 @@ limit.
 """
 
 _LACKS_S, _EXPLAINED = 0.1, 0.5
-"""The supply explains missing torque if it caused at least `_EXPLAINED` of it within the last `_LACKS_S` [s]."""
+"""The supply explains missing torque if it accounts for at least `_EXPLAINED` of it within the last `_LACKS_S` [s]."""
 
 _FEWEST = 4
 """Minimum number of readings from which to explain how a current differs from its goal."""
 
 Fault = tuple[Cause, str]
-"""The cause and a sentence without its subject, the joint."""
+"""The cause, and a sentence whose subject, the joint, is left out."""
 
 
 class JointFaults:

@@ -19,7 +19,7 @@ TOLERANCE_RAD = 0.04
 """A motor is considered reversed if the work that it has taken out of the arm, divided by the joint's largest planned
 torque, exceeds this [rad].
 
-Delays cause a healthy motor to take out up to 0.02 rad, for a heavy arm at 20 Hz.
+Because of delays, this is up to 0.02 rad for a healthy motor, with a heavy arm at 20 Hz.
 """
 
 _OF_OTHERS = 0.5
