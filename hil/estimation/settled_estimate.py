@@ -130,7 +130,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
 
 
 def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tuple[SettledPeriod | None, list[str]]:
-    """The settled period of the held-out multisine, if there is one, and a warning if the run ended before it."""
+    """The settled period of the held-out multisine, if there is one, and a warning if the recording ends too early."""
     if HELD_OUT not in facts.segments:
         return None, []
     try:

@@ -144,7 +144,7 @@ def _relative(first: str, ratios: Sequence[tuple[str, Quantity]], source: Source
 
 
 def by_voltage_said(joints: Sequence[JointConfig]) -> str:
-    """A sentence about what viscous friction includes for voltage-driven joints; empty for others."""
+    """A sentence about the back-EMF in the viscous friction of voltage-driven joints; "" if there are none."""
     if all(joint.drive_mode is not Mode.PWM for joint in joints):
         return ""
     return "The viscous friction of voltage-driven joints includes the motor's back-EMF."

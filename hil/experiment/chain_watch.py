@@ -37,7 +37,7 @@ friction of up to twice the mean from raising an alarm.
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
 WINDOW_S = 0.3
-"""Time over which a message about a stationary joint gives the range of its torque [s]."""
+"""Time span [s] of the torque range that a message about a stationary joint states."""
 
 
 class ChainWatch:

@@ -62,7 +62,7 @@ _NEAR_LIMIT = 0.05
 """Distance from a position limit, as a fraction of the range, within which a hard stop is named as a possible cause."""
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
-"""If a torque is held over several exchanges, a joint must appear stationary for this time before it is checked [s]."""
+"""If a torque is held over several exchanges, a joint must appear stationary for this time [s] before it is checked."""
 
 _LAG_S = 0.012
 """Time constant with which a torque step appears in the velocity [s]: current loop and velocity filter."""
@@ -85,9 +85,7 @@ _USUAL_S = 1.0
 _GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which changes of velocity are not checked."""
 _WINDOW_S = 0.3
-"""Time span over which a message about a stationary joint gives the range of its torque [s]: a single value may be near
-zero.
-"""
+"""Time span [s] of the torque range that a message about a stationary joint states: a single value may be near zero."""
 
 
 JOLT = np.dtype(

@@ -125,7 +125,7 @@ def run_experiment(
 
 @contextmanager
 def _with_torque(torque: str) -> Iterator[None]:
-    """Append the torque state to an error while closing the recording, or to a stop request while torque is cut."""
+    """Append the torque state to errors from closing the recording, and to stop requests while torque is cut."""
     try:
         yield
     except (RunFolderError, StopRequested) as error:

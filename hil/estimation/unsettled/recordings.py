@@ -126,7 +126,7 @@ def _once(sentences: Iterable[Sequence[str]]) -> tuple[str, ...]:
 
 
 def _doubted(result: ShootingResult, read: Converted) -> ShootingResult:
-    """The result with the doubts about the columns added to its verdict."""
+    """The result, with doubts about the columns added to its verdict."""
     verdict = result.verdict
     if not read.doubts or verdict is None:
         return result

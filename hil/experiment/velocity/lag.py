@@ -19,7 +19,7 @@ BLOCK_S, BLOCKS = 0.1, 4
 """Duration of a block [s], and the number of blocks that are compared with all earlier ones."""
 
 CHANGED_S, CHANGED_SHARE = 0.005, 0.35
-"""Accepted change of the lag: an absolute part [s], and a fraction of the former lag."""
+"""Accepted change of the lag: an absolute part [s], and a fraction of the earlier lag."""
 
 TIMES = 4.0
 NOISE_RAD, LASTS_S = 0.0015, 0.1
