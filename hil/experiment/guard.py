@@ -61,7 +61,7 @@ class Guard:
     heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did.
 
     left_by_a_run: whether the arm is where an immediately preceding run left it. If that run was stopped at a limit, a
-    joint may have come to rest slightly beyond it: such a joint may move back in, but no farther out.
+    joint may have come to rest slightly beyond it: such a joint may move back, but no farther out.
 
     recent: the exchanges so far, if another guard has checked them.
 

@@ -65,7 +65,7 @@ _STEP_S = 0.02
 """If a torque is held over several exchanges, a joint must appear stationary for this time [s] before it is checked."""
 
 _LAG_S = 0.012
-"""Time constant with which a torque step appears in the velocity [s]: current loop and velocity filter."""
+"""Time constant with which a torque step appears in the velocity [s], due to current loop and velocity filter."""
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 JOLT_S, JOLT_BACK_S = 0.01, 0.15

@@ -3,8 +3,8 @@
 Only the time during which this program waited for a reply that did not come counts as silence; for a stalled computer,
 the limits on missed deadlines (`hil.experiment.deadlines`) apply.
 
-A busy computer also delays received bytes: the kernel passes on the bytes of a serial port in a separate thread, which
-waits for a core like any other program, for 4 to 10 ms at a time. So while this program itself wakes up late, silence
+A busy computer also delays received bytes: the kernel passes on the bytes of a serial port in a separate thread, which,
+like any other program, waits for a core for 4 to 10 ms at a time. So while this program itself wakes up late, silence
 of all servos may be due to the computer, and the same limits apply.
 """
 

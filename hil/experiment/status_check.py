@@ -30,7 +30,7 @@ _CLOCK_DRIFT = 0.01
 _LEARNT_READINGS = 3
 _STALE_READINGS = 2
 _GOALS_MISSED = 2
-"""Number of consecutive mismatches before goals count as lost, because a single packet may be lost."""
+"""Number of consecutive mismatches at which goals count as lost: a single lost packet is not a fault."""
 
 _REMEMBERED = 256
 """Number of latest goals kept."""

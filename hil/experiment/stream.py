@@ -255,8 +255,8 @@ class Stream:
             self._play(segment.period_current, Phase.WARM_UP)
 
     def _play_periods(self, segment: Segment) -> None:
-        """Play periods until one matches its predecessor, so the motion has settled; then play the other periods to be
-        recorded.
+        """Play periods until one matches its predecessor, i.e. the motion has settled; then play the remaining periods
+        to be recorded.
         """
         samples = len(segment.period_current)
         repetition = self._repetition

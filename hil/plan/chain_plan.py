@@ -145,7 +145,7 @@ def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array |
 
 
 def check_rest_pose(config: Config) -> None:
-    """Raise ConfigError if, in the rest pose, parts of the arm would be inside each other, the floor or a box."""
+    """Raise ConfigError if, in the rest pose, parts of the arm would intersect each other, the floor or a box."""
     if wrong := Space.of(config).wrong_rest_pose():
         raise ConfigError(f"{config.path}: {wrong}.")
 

@@ -1,7 +1,7 @@
 """Detection of angles with a wrong scale: an encoder resolution, belt ratio or gear ratio other than the stated one.
 
 A joint's equation is linear in its angle except for gravity, so only gravity reveals the scale. Near the angle at which
-the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, a weaker gravity and a spring: with a
+the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, i.e. weaker gravity plus a spring: with a
 spring, an offset and an encoder zero, a fit explains angles with a wrong scale s down to the noise, but with wrong
 values. So if a fit finds a spring, the motion is fitted again without a spring but with the scale that would imitate
 one.

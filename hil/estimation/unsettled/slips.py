@@ -1,4 +1,4 @@
-"""Rejection of recordings with a clear mistake in their columns, whose estimate would take a minute and be useless."""
+"""Rejection of recordings with a clear mistake in their columns: an estimate would take a minute but be useless."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from hil.estimator.baselines.signs import (
 from hil.estimator.data.recording import Recording
 
 CLEAR = 0.25
-"""A mistake is clear only if correcting it reduces the torque residual to less than this fraction."""
+"""A mistake is clear only if correcting it multiplies the torque residual by less than this factor."""
 
 NEARLY_ALL = 0.9  # fraction of the segments
 STUCK_STEPS = 10.0  # motion in encoder steps below which a joint sticks

@@ -77,7 +77,7 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
 
 
 def _rows(recordings: Sequence[Recording]) -> list[str]:
-    """Detect rows that are missing between regular time steps, apart from gaps."""
+    """Detect rows that are missing from otherwise regular time steps, apart from gaps."""
     steps = [np.diff(each.time)[np.diff(each.time) < each.longest_interval] / each.interval for each in recordings]
     step = np.concatenate(steps)
     whole = np.round(step)

@@ -23,7 +23,7 @@ FEWEST_READINGS, MOST_READINGS = 8, 256
 """Number of readings from which noise is first measured, and number of latest readings that are kept."""
 
 _UNCERTAIN = 1.9
-"""Largest underestimate of noise measured from n readings, relative to the true noise, times sqrt(n)."""
+"""Largest underestimate of noise measured from n readings, as a multiple of the true noise divided by sqrt(n)."""
 
 _MAD_TO_SIGMA = 1.4826
 """Ratio of standard deviation to median absolute deviation of a normal distribution."""

@@ -23,7 +23,7 @@ exactly the same although the goals that they may reflect (those of the last `AN
 A constant sensor error cancels in this comparison.
 
 A current sensor may be noisier than assumed. Its noise is measured at constant goals, while the arm rests before the
-start (`current_noise`), and is a lower bound of sigma: a noisy reading then means that lost torque is found later, not
+start (`current_noise`), and is a lower bound on sigma: a noisy reading then means that lost torque is found later, not
 that a healthy motor is stopped.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). The state that it keeps for
@@ -46,10 +46,10 @@ SIGMA_SHARE = 0.05
 """Standard deviation of other errors, relative to the planned peak."""
 
 SIGMA_TICKS = 2.0
-"""Lower bound of the standard deviation of current errors, in register ticks."""
+"""Lower bound on the standard deviation of current errors, in register ticks."""
 
 ALLOWED_TICKS = 4.0
-"""Lower bound of the accepted deviation, in register ticks."""
+"""Lower bound on the accepted deviation, in register ticks."""
 
 LOST_AFTER_S = 0.03
 """Time for which a current must look like zero, at full weight, before it counts as zero [s]."""

@@ -28,8 +28,8 @@ _OF_OTHERS = 0.5
 MEMORY = np.dtype([("scale", "f8"), ("least", "f8"), ("done", "f8"), ("held", "f8")])
 """Constants and state of the check of one joint.
 
-scale: torque per goal [N m/A or N m/V]. least: work below which the sign is uncertain [J]. done: work done so far [J].
-held: latest goal [A or V].
+scale: torque per goal [N m/A or N m/V]. least: lowest work that does not indicate a reversal [J]. done: work done so
+far [J]. held: latest goal [A or V].
 """
 
 

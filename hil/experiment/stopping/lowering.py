@@ -1,4 +1,4 @@
-"""Stop of an arm that cannot hang freely: brake, then lower it to its rest pose while its servos accept commands.
+"""Stops an arm that cannot hang freely: brakes it, then lowers it to its rest pose while its servos accept commands.
 
 The feed-forward torque is combined with the stabiliser's spring and damper, which track the path to the rest pose;
 while a joint is off the path, an additional torque towards the path grows. Lowering is monitored like the experiment;
