@@ -122,7 +122,7 @@ def _torque_constants(config: Config) -> Array:
 
 
 def _stabilised(config: Config, rows: NDArray[np.void], torque: Array, first: int) -> Stabilised:
-    """Separate the stabiliser's contribution from `torque` (joints, samples) [N m]; first: row of its first sample."""
+    """Separate the stabiliser's contribution from `torque` (joints, samples) [N m]; first: its first row."""
     with_former = rows[first - 1 : first + torque.shape[1]]
     given = np.nan_to_num(feedback_torque(config, with_former)).T
     excitation = _by_period(torque - given, config.experiment.samples).mean(axis=0)

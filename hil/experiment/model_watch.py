@@ -111,7 +111,7 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
     If the joint reverses in both changes, the teeth of a gear with backlash have changed sides twice in succession: the
     motor crosses the gap much faster than it drives the arm. This is not a jolt.
 
-    joints: records of the type JOLT. former: the latest velocities (samples within `JOLT_S`, joints) [rad/s]. least:
+    joints: records of type JOLT. former: the latest velocities (samples within `JOLT_S`, joints) [rad/s]. least:
     smallest change that counts as a jolt [rad/s].
     """
     back = former.shape[0]

@@ -83,7 +83,7 @@ class StatusCheck:
         self._ticks = [(-1.0, 0.0)] * len(config.joints)
         """Servo's and computer's clock readings in the latest status [s], by joint."""
         self._foreign = [ForeignValues() for _ in config.joints]
-        """Goals that a status reported although this program never sent them, by joint."""
+        """Reported goals that this program never sent, by joint."""
         # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
         self._clock = [(0.0, 0.0, 0, 0)] * len(config.joints)
 
@@ -179,7 +179,7 @@ class StatusCheck:
         return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {self.why_lost()}"
 
     def _late(self, joint: int, held: float, former: float, ago: int) -> int:
-        """Return by how many cycles a servo's replies must be late; 0 if they need not be late.
+        """Return by how many cycles a servo's replies must be late, at least 0.
 
         They are late if the goal `held`, which is reported now, had already been sent `ago` cycles before, when a
         differing status reported the goal `former` instead [A or V].

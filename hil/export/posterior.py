@@ -154,7 +154,7 @@ def _physical(
     source: Source, names: tuple[str, ...], mean: Array, covariance: Array, values: Array, rng: np.random.Generator
 ) -> tuple[Array, int]:
     """Redraw every arm with negative inertia or friction, or without physically possible masses; return the draws and
-    the number of replaced ones.
+    how many were replaced.
     """
     root, redrawn = _root(covariance), 0
     for _ in range(_TRIES):

@@ -185,7 +185,7 @@ def _rate_meaning(arm: ArmAnswers) -> str:
 
 
 def _exchange(arm: ArmAnswers) -> list[str]:
-    """Return the [port] settings that the measured rate requires if they differ from the defaults."""
+    """Return the [port] settings, other than the defaults, that the measured rate requires."""
     if arm.measured is None:
         return []
     one_write = [] if arm.measured.one_write else [_line("one_write = false", "this bus is faster with two writes")]

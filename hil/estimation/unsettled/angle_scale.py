@@ -113,7 +113,7 @@ def _fitted(
 
 
 def _scaled(recordings: Sequence[Recording], factor: Array, about: Array) -> list[Recording]:
-    """The recordings, in which each angle relative to `about` (joints,) [rad] is divided by `factor` (joints,)."""
+    """The recordings, with each angle's distance from `about` (joints,) [rad] divided by `factor` (joints,)."""
     centre = about[:, None]
     return [
         replace(

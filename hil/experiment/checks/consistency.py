@@ -31,8 +31,8 @@ Lag and scale error are properties of a servo and do not change. A lag that chan
 (`hil.experiment.velocity.lag`). Once the motion has revealed lag and scale error, up to twice the estimated values are
 accepted, plus `MORE_LAG_S` and `MORE_SCALE` and twice their standard deviations.
 
-The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). The state that it keeps for
-a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). Its state for a joint is a
+record of type `MEMORY`.
 """
 
 from collections.abc import Iterable
@@ -263,7 +263,7 @@ def moved_at_standstill(states: Iterable[State], joint: int, still: float) -> st
 def check_standstill(name: str, states: Iterable[State], joint: int, still: float) -> None:
     """Raise SafetyStop if a joint moved while its velocity was reported to be below `still` [rad/s].
 
-    name: name of the joint. states: as in `moved_at_standstill`.
+    states: as in `moved_at_standstill`.
     """
     states = list(states)
     if moved := moved_at_standstill(states, joint, still):

@@ -3,8 +3,8 @@
 Work is checked only without a stabiliser. Without one, the arm starts at a stable rest pose and cannot return more work
 than was put in. A motor that keeps taking work out of it therefore turns the wrong way.
 
-The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). The state that it keeps for
-a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). Its state for a joint is a
+record of type `MEMORY`.
 """
 
 from typing import Any
