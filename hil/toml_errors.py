@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from hil.unit_hints import allowed_by, in_other_units, unit_of
 
 UNSAID = "~"
-"""Prefix of the alternatives' names that pydantic adds to a location although the file does not contain them."""
+"""Prefix of names that pydantic adds to a location to identify an alternative; the file does not contain them."""
 
 _EXPECTED = {
     "float_type": "must be a number",

@@ -23,7 +23,7 @@ def describe_validation(
     held_out: Array | None,
     held_out_as_fitted: Array | None = None,
 ) -> Validation:
-    """Convert the validation; held_out, held_out_as_fitted: as in `hil.estimator.selection.verdict.Evidence`."""
+    """Convert a validation. held_out, held_out_as_fitted: as in `hil.estimator.selection.verdict.Evidence`."""
     first, second, correlation = found.confounded
     levels, lines = found.levels, found.levels.lines
     return Validation(
@@ -79,9 +79,7 @@ def describe_choice(choice: trial.Choice) -> ModelChoice:
 
 
 def describe_segment_choice(choice: unsettled.SegmentChoice) -> ModelChoice:
-    """Convert the choice among models for unsettled data, which is based on held-out segments, to the form stored in a
-    result.
-    """
+    """Convert the choice among models for unsettled data (by held-out segments) to the form stored in a result."""
     return ModelChoice(
         chosen=choice.chosen.model.description,
         error_divided_by=choice.gained,
@@ -90,7 +88,7 @@ def describe_segment_choice(choice: unsettled.SegmentChoice) -> ModelChoice:
 
 
 def describe_chain_choice(choice: ChainChoice) -> ModelChoice:
-    """Convert the choice among models of a spatial arm, which is based on one-step predictions of the fitted motion."""
+    """Convert the choice among models of a spatial arm (by one-step predictions of the fitted motion)."""
     return ModelChoice(
         chosen=choice.estimate.model.description,
         error_divided_by=choice.gained,

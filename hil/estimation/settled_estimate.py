@@ -1,4 +1,4 @@
-"""Estimate a result from a run's settled period in two stages, and validate it on a held-out multisine."""
+"""Two-stage estimation from a run's settled period, and its validation on a held-out multisine."""
 
 import logging
 import time
@@ -55,7 +55,7 @@ log = logging.getLogger(__name__)
 def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledResult:
     """Estimate from the recording in `run`, write its result.json and return the result.
 
-    executor: starts in advance the fits that `friction = "auto"` may need. Raises HilError, EstimationError.
+    executor: starts fits early, in case `friction = "auto"` needs them. Raises HilError, EstimationError.
     """
     config, facts = run.load_config(), run.load_facts()
     if config.is_chain:
@@ -130,7 +130,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
 
 
 def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tuple[SettledPeriod | None, list[str]]:
-    """The settled period of the held-out multisine, if there is one, and a warning if the run ended before it."""
+    """The settled period of the held-out multisine, if there is one, and a warning if the recording ends too early."""
     if HELD_OUT not in facts.segments:
         return None, []
     try:
@@ -154,8 +154,8 @@ def _torque_instead(other: SettledPeriod | None, estimate: Estimate, drift: Drif
 
 
 def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift | None, is_corrected: bool) -> PlayedPeriod:
-    """Predict the held-out period with the friction at that time. is_corrected: whether to correct the prediction for
-    friction that changes within the period, as was done for the fitted period.
+    """Predict the held-out period with the friction that the arm had then. is_corrected: whether to correct the
+    prediction for friction that changes within the period, as for the fitted period.
     """
     if drift is None:
         return PlayedPeriod(other.rate, other.torque, other.position, predict_period(estimate, other))
@@ -196,7 +196,7 @@ def _estimate(
     starts: list[dict[str, float]],
     executor: Executor | None,
 ) -> tuple[Estimate, Choice | None]:
-    """Fit the configured model, or choose one; the choice is None if the model is fixed."""
+    """Fit the configured model (the choice is then None) or, if its friction is "auto", choose one."""
     wanted, by_voltage, lever = config.model, voltage_driven(config), lever_of(config)
     if wanted.friction == "auto":
         choice = choose(

@@ -20,8 +20,8 @@ from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
 
 _AROUND_S, _FEWEST_AROUND = 0.04, 4
-"""A sample's velocity is determined from the readings within this time [s] before and after it. Second value: minimum
-number of readings on each side.
+"""Time [s] before and after a sample within which readings determine its velocity, and minimum number of readings on
+each side.
 """
 
 
@@ -82,9 +82,8 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
 
 
 def _passes(position: Array, first: int, on_time: Array) -> tuple[Array, ...]:
-    """Second halves of the settled periods `on_time` (periods, joints, samples), and of the period before them.
-
-    The first half of the latter may still contain a transient.
+    """Second halves of the settled periods `on_time` (periods, joints, samples) and of the period before them, whose
+    first half may still contain a transient.
     """
     half = on_time.shape[2] // 2
     return position[first - 1, :, half:], *on_time[:, :, half:]
@@ -123,7 +122,7 @@ def _torque_constants(config: Config) -> Array:
 
 
 def _stabilised(config: Config, rows: NDArray[np.void], torque: Array, first: int) -> Stabilised:
-    """Separate the stabiliser's part of `torque` (joints, samples) [N m], which starts at row `first`."""
+    """Separate the stabiliser's contribution from `torque` (joints, samples) [N m]; first: its first row."""
     with_former = rows[first - 1 : first + torque.shape[1]]
     given = np.nan_to_num(feedback_torque(config, with_former)).T
     excitation = _by_period(torque - given, config.experiment.samples).mean(axis=0)
@@ -162,5 +161,5 @@ def _first_settled(position: Array, within: float) -> int | None:
 
 
 def _drifting(position: Array, within: float, wanted: int) -> int | None:
-    """Index of the first of the last `wanted` periods if only slow drift remains; otherwise None."""
+    """Index at which the last `wanted` periods begin if only slow drift remains; otherwise None."""
     return len(position) - wanted if settling_difference(position[-2], position[-1]) <= within else None

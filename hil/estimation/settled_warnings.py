@@ -1,4 +1,4 @@
-"""Warnings about a recording that do not prevent the estimation, each with the joint and a remedy."""
+"""Warnings about a recording that can still be used for an estimate; each names the joint and a remedy."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,7 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
 
 
 def _late_share(config: Config, samples: NDArray[np.void]) -> float:
-    """Fraction of the periodic samples that this computer wrote late, or skipped because it was too late."""
+    """Fraction of the periodic samples that this computer wrote late, or skipped because it was running late."""
     played = samples[samples["phase"] == Phase.PERIODIC]
     left_out = played["time_after_read"] <= played["time_before_write"]
     late = played["time_before_write"] - played["deadline"] > LATE / config.experiment.rate

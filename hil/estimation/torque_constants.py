@@ -14,7 +14,7 @@ RATIO = "torque_scale"
 USUAL_RATIO_STD = math.hypot(USUAL_TORQUE_SPREAD, USUAL_TORQUE_SPREAD)
 CONTRADICTORY = 2.0  # standard deviations, those of the torque constants and of the ratio combined
 COLUMNS_APART = 1.0
-"""Relative standard deviation assumed for the ratio of two torque columns, because the scale of neither is known."""
+"""Relative standard deviation assumed for the ratio of two torque columns, whose scales are unknown."""
 Source = Literal["constant", "column"]
 """Where a joint's torque comes from: its torque constant, or a column of a recording."""
 _STATES: dict[Source, str] = {"constant": "torque constants", "column": "torque columns"}
@@ -94,7 +94,7 @@ def contradictions(
 
     joints: names. extra: terms of a result that include the ratios, if there are any. ratio_std: relative standard
     deviation of the ratio of the torque constants, by parameter; where it is not given, the spread among servos of one
-    model is assumed. known: contradictions that have their own sentences.
+    model is assumed. known: contradictions that are already reported.
     """
     said = {each.name for each in known}
     found = []
@@ -144,7 +144,7 @@ def _relative(first: str, ratios: Sequence[tuple[str, Quantity]], source: Source
 
 
 def by_voltage_said(joints: Sequence[JointConfig]) -> str:
-    """A sentence about what viscous friction includes for voltage-driven joints; empty for others."""
+    """A sentence about the back-EMF in the viscous friction of voltage-driven joints; "" if there are none."""
     if all(joint.drive_mode is not Mode.PWM for joint in joints):
         return ""
     return "The viscous friction of voltage-driven joints includes the motor's back-EMF."

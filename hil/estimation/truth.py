@@ -26,7 +26,7 @@ _DETERMINED = 0.02
 
 
 def true_parameters(config: Config, time: float = math.inf) -> dict[str, float] | None:
-    """The base parameters by name [SI]; None for a real arm, empty for a fake arm that does not state them.
+    """The base parameters by name [SI]; None for a real arm, empty for a fake arm whose file does not state them.
 
     time: time since the arm was switched on [s], for drives whose friction changes as they warm up. The back-EMF of a
     voltage-driven joint counts as viscous friction.
@@ -91,7 +91,7 @@ def scaled(truth: Mapping[str, float] | None, config: Config, extra: Mapping[str
 
 
 def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str], joints: int) -> Truth:
-    """True values scaled to the file's torque constants, as in a result with parameters of these names."""
+    """True values scaled to the file's torque constants. names: names of the result's parameters."""
     ratios, has_ratios = _torque_ratios(config), any(kind_of(each) == RATIO for each in names)
     if not truth or all(abs(ratio - 1.0) <= _EQUAL for ratio in ratios):
         return Truth(dict(truth), "")
@@ -115,9 +115,7 @@ def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str
 
 
 def _torque_ratios(config: Config) -> list[float]:
-    """Torque per goal according to the file, divided by that of the fake arm's motors, per joint; 1 if the latter is
-    unknown.
-    """
+    """Torque per goal of each joint according to the file, divided by that of the fake arm's motor, or 1 if unknown."""
     fake = config.fake
     arm = None if not config.is_fake or fake is None else fake.arm or fake.chain
     if fake is None or arm is None:

@@ -1,9 +1,9 @@
 """Check during the experiment that a spatial arm's motion is consistent with some arm of the dry run's ensemble.
 
 Prior knowledge is the ensemble's mean and inflated covariance. While the arm is in its rest pose, something may support
-it, so no joint is judged. A joint that stands still at its rest angle may lie against an end stop there. It is
-therefore judged only by torques towards the side on which it has been. A joint that has not left its rest angle yet may
-rest against a stop on the side to which gravity pulls it: it is judged only while it is commanded to that side.
+it, so no joint is judged. A joint that stands still at its rest angle may be lying against an end stop, so it is
+judged only by torques towards the side on which it has been. A joint that has not left its rest angle yet may be lying
+against a stop on the side to which gravity pulls it: it is judged only while its torque acts towards that side.
 """
 
 import math
@@ -37,7 +37,7 @@ friction of up to twice the mean from raising an alarm.
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
 WINDOW_S = 0.3
-"""Time over which a message about a stationary joint gives the range of its torque [s]."""
+"""Time span [s] of the torque range that a message about a stationary joint states."""
 
 
 class ChainWatch:

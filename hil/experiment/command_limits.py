@@ -1,6 +1,4 @@
-"""Limits on commanded goals: the largest goal of each joint, its rate of change, and rejection of values that are not
-finite.
-"""
+"""Limits on the size and rate of change of commanded goals, and rejection of values that are not finite."""
 
 from collections.abc import Sequence
 from math import inf

@@ -20,7 +20,7 @@ _WHY_LATE = (
 
 
 class Deadlines:
-    """Counts missed deadlines of the samples. Every method may raise SafetyStop.
+    """Counts the samples' missed deadlines. Every method may raise SafetyStop.
 
     heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did. any_share:
     whether to ignore the fraction of missed deadlines: while an arm is being lowered, only the time without a command

@@ -36,7 +36,7 @@ from hil.plan.recent_motion import RecentMotion
 __all__ = ["MOST_OUTSIDE_RAD", "Guard"]
 
 JUMP_FACTOR = 1.5
-"""Distance that a joint may appear to move between two samples, relative to the one its velocity limit allows."""
+"""Distance that a joint may appear to move between two samples, relative to what its velocity limit allows."""
 
 EARLY_MOTION_RAD = 0.05
 """Largest motion allowed while the arm rests before the start [rad]."""
@@ -61,7 +61,7 @@ class Guard:
     heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did.
 
     left_by_a_run: whether the arm is where an immediately preceding run left it. If that run was stopped at a limit, a
-    joint may have come to rest slightly beyond it: such a joint may move back in, but no farther out.
+    joint may have come to rest slightly beyond it: such a joint may move back, but no farther out.
 
     recent: the exchanges so far, if another guard has checked them.
 
@@ -134,7 +134,7 @@ class Guard:
         self._silence.woke_up(now, late)
 
     def others_answer(self) -> None:
-        """Record that some servos that are not heard do answer: a silent one hides their replies."""
+        """Record that some unheard servos do answer, but a silent one hides their replies."""
         self._silence.others_answer = True
 
     def late(self, seconds: float = 0.0) -> None:
@@ -232,14 +232,14 @@ class Guard:
         self._stop(index, *TORQUE_LOST)
 
     def rests_at(self, positions: Sequence[float]) -> None:
-        """Set the joints' angles before torque was switched on [rad]; by default, those of the first sample are used.
-        From now on, `measure_noise` is called with each exchange until `noise_is_known`.
+        """Store the angles that the joints had before torque was switched on [rad]; by default, those of the first
+        sample are used. From now on, `measure_noise` is called with each exchange until `noise_is_known`.
         """
         self._resting = positions
         self._noise.begin()
 
     def measure_noise(self, state: State) -> None:
-        """Process an exchange of an arm at rest: until its noise is known, any deviation of a current reading is
+        """Process an exchange of an arm at rest: until the noise is known, any deviation of a current reading is
         accepted.
         """
         self._noise.add(state)

@@ -51,29 +51,29 @@ _INERTIA = 0.3
 """Standard deviations for an arm without a description, as multiples of the planned torque in SI units.
 
 Gravity may be ten times as large as a small first torque, which then moves the arm by a tenth of a radian. But viscous
-friction and inertia cannot be several times as large as the planned torque, because the arm would then hardly move. If
-the excitation is slower than `_USUAL_HZ`, they can, proportionally: long, heavy arms are excited slowly.
+friction and inertia cannot be several times as large as the planned torque, because the arm would then hardly move. For
+an excitation slower than `_USUAL_HZ`, their values are raised in proportion: long, heavy arms are excited slowly.
 """
 _USUAL_HZ = 0.7
-"""Geometric mean of the lowest and highest frequencies below which the excitation counts as slow."""
+"""An excitation counts as slow if the geometric mean of its lowest and highest frequencies is below this."""
 _FLAT = 0.3
 """Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the units of `_INERTIA`."""
 _NEAR_LIMIT = 0.05
 """Distance from a position limit, as a fraction of the range, within which a hard stop is named as a possible cause."""
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
-"""If a torque is held over several exchanges, a joint must appear stationary for this time before it is checked [s]."""
+"""If a torque is held over several exchanges, a joint must appear stationary for this time [s] before it is checked."""
 
 _LAG_S = 0.012
-"""Time constant with which a torque step appears in the velocity [s]: current loop and velocity filter."""
+"""Time constant with which a torque step appears in the velocity [s], due to current loop and velocity filter."""
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 JOLT_S, JOLT_BACK_S = 0.01, 0.15
-"""Times within which a slipping joint's velocity changes, and returns [s]."""
+"""Times within which a slipping joint's velocity changes, and changes back [s]."""
 
 JOLT_RAD_S, JOLT_TIMES = 1.2, 5.0
 """Smallest change of velocity in `JOLT_S` that counts as a jolt [rad/s], and its smallest ratio to the RMS of ordinary
-ones.
+changes.
 """
 
 PLAY_RAD, CURVED = 0.015, 0.2
@@ -85,9 +85,7 @@ _USUAL_S = 1.0
 _GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which changes of velocity are not checked."""
 _WINDOW_S = 0.3
-"""Time span over which a message about a stationary joint gives the range of its torque [s]: a single value may be near
-zero.
-"""
+"""Time span [s] of the torque range that a message about a stationary joint states: a single value may be near zero."""
 
 
 JOLT = np.dtype(
@@ -96,16 +94,16 @@ JOLT = np.dtype(
 )
 """Statistics of a joint's changes of velocity; initially zero, except `begun`, which is minus infinity.
 
-square: mean square of ordinary changes [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may
-still turn out to belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s]. begun: time
-of that change [s]. count, oldest: number of earlier velocities stored, and the row of the oldest. reversed: whether the
-joint reversed in the first change of a possible jolt.
+square: mean square of ordinary changes [rad^2/s^2], over age [s]. squared, since: integral of the squared changes not
+yet included, because they may belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s].
+begun: time of that change [s]. count, oldest: number of earlier velocities stored, and the row of the oldest. reversed:
+whether the joint reversed in the first change of a possible jolt.
 """
 
 
 def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float, least: float) -> int:
     """Process velocities [rad/s], `seconds` after the previous ones [s]; return a joint whose velocity jumped and
-    returned a moment later, as when its horn slips, or -1.
+    jumped back a moment later, as when its horn slips; -1 if there is none.
 
     No motor can do this on any arm: it would have to accelerate and brake much harder than ever before. The check
     therefore needs no knowledge of the arm. Changes of velocity over `JOLT_S` are compared with ordinary ones.
@@ -113,7 +111,7 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
     If the joint reverses in both changes, the teeth of a gear with backlash have changed sides twice in succession: the
     motor crosses the gap much faster than it drives the arm. This is not a jolt.
 
-    joints: records of the type JOLT. former: the latest velocities (samples within `JOLT_S`, joints) [rad/s]. least:
+    joints: records of type JOLT. former: the latest velocities (samples within `JOLT_S`, joints) [rad/s]. least:
     smallest change that counts as a jolt [rad/s].
     """
     back = former.shape[0]
@@ -158,15 +156,15 @@ _TIMES = np.dtype(
 """Quantities that depend on the times of the samples.
 
 seen_at, seconds: time of the latest sample, and time since the previous one [s]; seconds is infinite if the motion in
-between is not judged. shortest: duration of the shortest exchange [s]. vague: largest excess over it at which the time
-of a measurement counts as known [s]. longest_gap: largest `seconds` over which changes of velocity are judged [s].
+between is not judged. shortest: duration of the shortest exchange [s]. vague: largest excess over this at which the
+time of a measurement counts as known [s]. longest_gap: largest `seconds` over which changes of velocity are judged [s].
 follows: fraction of a torque step that the motor has followed by the next sample. least: smallest change of velocity
 that counts as a jolt [rad/s].
 """
 
 _DRIVE = np.dtype([(name, "f8") for name in ("constant", "goal", "felt")])
-"""A joint's torque: the constant [N m/A or N m/V], the latest goal [A or V], NaN before the first one, and the torque
-that the motor has reached [N m].
+"""A joint's torque: the constant [N m/A or N m/V], the latest goal [A or V] (NaN before the first one), and the
+torque that the motor has reached [N m].
 """
 
 

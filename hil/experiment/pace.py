@@ -1,4 +1,4 @@
-"""Timing of a stream's exchanges: samples, exchanges between samples, and the read-backs before each."""
+"""Timing of a stream's exchanges: samples, exchanges between samples, and the read-backs before each of them."""
 
 from collections.abc import Iterator, Sequence
 from math import inf

@@ -28,8 +28,8 @@ FLOOR_RAD = 0.05
 
 LASTING_S = 0.03
 UNJUDGED_S, _MOST_UNJUDGED = 0.2, 0.25
-"""Time at the end of a period that does not affect the tolerance in the next one [s], and its largest fraction of a
-period.
+"""Time at the end of a period that does not affect the tolerance in the next one [s], and its upper bound, as a
+fraction of the period.
 """
 
 _FEWEST = 2  # samples, however low the rate
@@ -49,10 +49,10 @@ _SUMS = np.dtype(
 )
 """Running sums of one joint.
 
-lowest, highest: range of its positions [rad]. first: first position compared, which is subtracted from the others to
-avoid cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of
-squares and number of changes from the previous period. early_squared, early_pairs: the same for the first half of the
-period. sure_squared, sure_pairs: the same for the second half without its end.
+lowest, highest: range of its positions [rad]. first: first position in the second half of the period. sum,
+sum_of_squares, seen: sum, sum of squares and number of the positions in that half, relative to `first` to avoid
+cancellation. squared, pairs: sum of squares and number of their changes from the previous period. early_squared,
+early_pairs: the same for the first half. sure_squared, sure_pairs: the same for the second half without its end.
 """
 
 

@@ -125,7 +125,7 @@ def run_experiment(
 
 @contextmanager
 def _with_torque(torque: str) -> Iterator[None]:
-    """Append the torque state to an error while closing the recording, or to a stop request while torque is cut."""
+    """Append the torque state to errors from closing the recording, and to stop requests while torque is cut."""
     try:
         yield
     except (RunFolderError, StopRequested) as error:
@@ -261,8 +261,8 @@ def _check_unchanged(bus: ServoBus) -> Settings:
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, modes_seen_ago: float) -> None:
     """Name settings that another program changed. They are read only once torque is off, because reading takes time.
 
-    Changes that can explain a stop are named before its message; others, including any that may have followed the stop,
-    after it.
+    Changes that can explain a stop are named before its message. Others, including any that may have followed the stop,
+    are named after it.
     """
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return
@@ -302,7 +302,7 @@ def _watched(clock: Clock, watch: Watch) -> Iterator[Watch]:
 
 
 def _wait_for_rest(config: Config, bus: ServoBus) -> Lies:
-    """Wait until a swinging arm has come to rest; return where it then lies.
+    """Wait until a swinging arm has come to rest; return the servos' positions.
 
     Raises ExperimentError if it has moved far since the start, or a spatial arm does not come to rest; BusShared if
     another program switches torque on.

@@ -1,10 +1,10 @@
 """How long servos have been silent.
 
 Only the time during which this program waited for a reply that did not come counts as silence; for a stalled computer,
-the limits of missed deadlines (`hil.experiment.deadlines`) apply.
+the limits on missed deadlines (`hil.experiment.deadlines`) apply.
 
-A busy computer also delays received bytes: the kernel passes on the bytes of a serial port in a separate thread, which
-waits for a core like any other program, for 4 to 10 ms at a time. So while this program itself wakes up late, silence
+A busy computer also delays received bytes: the kernel passes on the bytes of a serial port in a separate thread, which,
+like any other program, waits for a core for 4 to 10 ms at a time. So while this program itself wakes up late, silence
 of all servos may be due to the computer, and the same limits apply.
 """
 
@@ -54,8 +54,7 @@ class Silence:
         self.any_missed = False
         """Whether any joint has missed the latest reply."""
         self.others_answer = False
-        """Whether servos whose replies are missing are known to answer, their replies being hidden by a silent servo.
-        """
+        """Whether the servos whose replies are missing are known to answer: a silent servo hides their replies."""
 
     @property
     def is_busy(self) -> bool:
@@ -82,7 +81,7 @@ class Silence:
         self.any_missed = any(self.counts)
 
     def all_heard(self, now: float) -> None:
-        """Record an exchange, begun at `now` [s], to which all joints replied, as they did to the previous one."""
+        """Record an exchange begun at `now` [s]; all joints replied to it and to the previous one."""
         self._asked_at = self._all_heard_at = now
 
     def missed(

@@ -30,13 +30,13 @@ _CLOCK_DRIFT = 0.01
 _LEARNT_READINGS = 3
 _STALE_READINGS = 2
 _GOALS_MISSED = 2
-"""Number of consecutive mismatches before goals count as lost, because a single packet may be lost."""
+"""Number of consecutive mismatches at which goals count as lost: a single lost packet is not a fault."""
 
 _REMEMBERED = 256
 """Number of latest goals kept."""
 
 _HELD_BEFORE = 4
-"""If writes are lost, a servo may also hold one of the last `_HELD_BEFORE` goals before the latest matching status."""
+"""If writes are lost, a servo may also hold one of the last `_HELD_BEFORE` goals sent before a status last matched."""
 
 
 OLD_REPLIES = (
@@ -83,7 +83,7 @@ class StatusCheck:
         self._ticks = [(-1.0, 0.0)] * len(config.joints)
         """Servo's and computer's clock readings in the latest status [s], by joint."""
         self._foreign = [ForeignValues() for _ in config.joints]
-        """Goals in the status that this program never sent, by joint."""
+        """Reported goals that this program never sent, by joint."""
         # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
         self._clock = [(0.0, 0.0, 0, 0)] * len(config.joints)
 
@@ -179,9 +179,10 @@ class StatusCheck:
         return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {self.why_lost()}"
 
     def _late(self, joint: int, held: float, former: float, ago: int) -> int:
-        """By how many cycles a servo's replies are late, given that it holds a goal that had been sent, but was not
-        held, when its status last differed, `ago` cycles before; 0 if they need not be late. former: the goal held then
-        [A or V].
+        """Return by how many cycles a servo's replies must be late, at least 0.
+
+        They are late if the goal `held`, which is reported now, had already been sent `ago` cycles before, when a
+        differing status reported the goal `former` instead [A or V].
         """
         half = self._half_tick[joint]
         for cycles, goals in enumerate(reversed(self._goals)):
@@ -191,7 +192,7 @@ class StatusCheck:
         return 0
 
     def why_lost(self) -> str:
-        """Return why goals are lost, for example to unexpected bytes on the wire."""
+        """Return why goals are lost, for example because of unexpected bytes on the wire."""
         refused = (
             "Goals are being lost in transit, the servo refuses them (check its cable and limits), or a device on the "
             "bus repeats its old replies."
@@ -256,7 +257,7 @@ class StatusCheck:
 
 
 def _unlike_armed(longer: int) -> str:
-    """What a changed watchdog timeout means; longer: its increase [20 ms], 0 if it is off."""
+    """What a changed watchdog timeout means; longer: its increase [20 ms], 0 if the watchdog is off."""
     if not longer:
         return "is no longer protected"
     return f"stops by itself {'later' if longer > 0 else 'earlier'} than intended"

@@ -146,7 +146,7 @@ class Stream:
         """Time from the latest correct read-back of the operating modes to a stop by the guard [s]."""
 
     def begins_at(self, positions: Sequence[float]) -> None:
-        """Set the joints' angles just before torque is switched on [rad]; the first sample must agree with them."""
+        """Store the joints' last angles before torque is switched on [rad]; the first sample must agree with them."""
         self._guard.rests_at(positions)
 
     @property
@@ -226,8 +226,8 @@ class Stream:
             self._note(noisy)
 
     def _check_velocity(self, state: State, window: int) -> None:
-        """Raise SafetyStop, which no brake may follow, for a joint that reports a velocity although its position has
-        not changed in the last `window` samples.
+        """Raise SafetyStop, with a cause that rules out braking, if a joint reports a velocity although its position
+        has not changed in the last `window` samples.
 
         The last sample alone does not prove this: at a low rate, a joint may have begun to move right before it.
         Therefore the sample before it must report a velocity too, or earlier samples must report velocities that would
@@ -255,8 +255,8 @@ class Stream:
             self._play(segment.period_current, Phase.WARM_UP)
 
     def _play_periods(self, segment: Segment) -> None:
-        """Play periods until one matches its predecessor, so the motion has settled; then play the other periods to be
-        recorded.
+        """Play periods until one matches its predecessor, i.e. the motion has settled; then play the remaining periods
+        to be recorded.
         """
         samples = len(segment.period_current)
         repetition = self._repetition

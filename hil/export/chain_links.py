@@ -1,5 +1,5 @@
-"""Links for the export of an identified spatial arm: among all physically possible links with the identified
-dynamics, those closest to the URDF.
+"""Links for the export of an identified spatial arm: of all physically possible links with the identified dynamics,
+the ones closest to the URDF are used.
 """
 
 from collections.abc import Mapping
@@ -73,8 +73,9 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
 def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
     """Separate a link from the parts that its held joints move, such as gripper fingers, which keep their inertia.
 
-    If the described masses of these parts leave no physically possible body for the link itself, they are multiplied by
-    a common fraction, which is halved until a body is possible. Returns the link's body and that fraction.
+    If the described masses of these parts leave no physically possible body for the link itself, the masses are
+    multiplied by a common fraction, which is halved until a body is possible. Returns the link's body and that
+    fraction.
     """
     share = 1.0
     for _ in range(HALVINGS):

@@ -1,4 +1,4 @@
-"""Masses, centres of mass and inertias that have exactly the identified base parameters.
+"""Masses, centres of mass and inertias that reproduce the identified base parameters exactly.
 
 Torque and position determine combinations such as m2 l1 c2, never a single mass. URDF and MJCF need masses, so one
 distribution is chosen among all dynamically equivalent ones (m mass, c centre, J inertia about the centre, l length):
@@ -77,7 +77,7 @@ def _elbow(model: ArmModel, link_length: float | None) -> tuple[float, float]:
 
 
 def _share_of_rod(p: Mapping[str, float]) -> float:
-    """Share of m2 c2^2 in inertia_2: that of a rod, or more if such a rod would be too heavy for inertia_1."""
+    """Ratio of m2 c2^2 to inertia_2: that of a rod, or more if such a rod would be too heavy for inertia_1."""
     needed = p["coupling"] ** 2 / (p["inertia_1"] * p["inertia_2"])
     if needed >= 1:
         raise ExportError(
@@ -89,8 +89,8 @@ def _share_of_rod(p: Mapping[str, float]) -> float:
 
 
 def _link(moment: float, about_joint: float, share: float, farthest: float) -> LinkMass:
-    """A link with first moment m c and second moment J + m c^2 about its joint; m c^2 is `share` of the latter if
-    possible.
+    """A link with first moment m c and second moment J + m c^2 about its joint; if possible, m c^2 is `share` times the
+    second moment.
     """
     if moment == 0:
         length = farthest if math.isfinite(farthest) else _UNKNOWN_LENGTH

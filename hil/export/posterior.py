@@ -153,8 +153,8 @@ def _matched(rng: np.random.Generator, samples: int, count: int) -> Array:
 def _physical(
     source: Source, names: tuple[str, ...], mean: Array, covariance: Array, values: Array, rng: np.random.Generator
 ) -> tuple[Array, int]:
-    """Redraw every arm that has negative inertia or friction or no physical masses; return the draws and how many were
-    replaced.
+    """Redraw every arm with negative inertia or friction, or without physically possible masses; return the draws and
+    how many were replaced.
     """
     root, redrawn = _root(covariance), 0
     for _ in range(_TRIES):

@@ -15,8 +15,7 @@ from hil.pilot.options import PilotOptions
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
-    """Return `torque` (joints,) [N m] with that of joints that stood `still` raised to `ratio` times their `former`
-    torque.
+    """Return `torque` (joints,) [N m], but `ratio` times the `former` torque for joints that stood `still`.
 
     most: upper limit for those joints, set by the current limits (joints,) [N m].
     """

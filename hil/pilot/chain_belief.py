@@ -35,8 +35,8 @@ _LEAST_FRICTION_SHARE = 1e-4
 _POSES = 12
 _HALVINGS = 6
 _LIGHTER, _LIGHTER_THAN_MEAN = 0.25, 0.5
-"""Smallest plausible inertia of a joint, as a fraction of its inertia in the lightest arm of the prior, and in the arm
-with the fitted parameters. The smaller of these two inertias is the lower bound.
+"""Smallest plausible inertia of a joint, as fractions of its inertia in the lightest arm of the prior and in the arm
+with the fitted parameters. The smaller result is the lower bound.
 """
 
 SIMULATED = 100

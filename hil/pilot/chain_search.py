@@ -126,14 +126,12 @@ class ChainSearch(SafeShares):
         return found
 
     def limit_after(self, error: ExperimentError, found: Found) -> None:
-        """Reduce the largest allowed amplitude after a run was stopped, unless this was because it did not settle or a
-        joint did not move.
-        """
+        """Reduce the largest allowed amplitude after a stopped run, unless it did not settle or a joint stood still."""
         if not isinstance(error, NotSettled | DidNotMove):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
-        """Play a run and set `last` to its share of the amplitude; return the error that ended it early, or None.
+        """Play a run and set `last` to its fraction of the amplitude; return the error that ended it early, or None.
 
         Only errors that are informative about the arm are returned; all others are raised.
         """

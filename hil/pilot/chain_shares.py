@@ -1,4 +1,4 @@
-"""The largest share of the designed paths' amplitude that is safe for every spatial arm of the current belief.
+"""The largest fraction of the designed paths' amplitude that is safe for every spatial arm of the current belief.
 
 `hil identify` and `hil dry-run` both use this search, on the same arms, so that they agree.
 """
@@ -25,22 +25,22 @@ from hil.plan.plan import Plan
 from hil.setup.session.servo_session import Say
 
 SEARCH_ARMS, ARMS = 24, 72
-"""Numbers of arms simulated to find a safe share of the amplitude, and to confirm it."""
+"""Numbers of arms simulated to find a safe fraction of the amplitude, and to confirm it."""
 
 PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
 SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4, 0.28, 0.18)
 SMALL = 0.5
-"""If the safe share is below this fraction of the desired one, other paths with more reserve are designed."""
+"""If the safe amplitude is below this fraction of the desired one, other paths with more reserve are designed."""
 
 REDESIGNS = 2
 
 OTHER_SEEDS = 2
-"""Number of paths designed from other seeds if no share of a path is safe."""
+"""Number of paths designed from other seeds if a path is not safe at any amplitude."""
 
 _NEXT_SEED = 100
 
 MOST_SIMULATED_S = 60_000.0
-"""A search tries no further paths after it has simulated this much motion [s], over all arms: about a minute of
+"""A search tries no further paths after it has simulated this much motion [s], summed over all arms: about a minute of
 processor time with six joints.
 """
 
@@ -48,7 +48,7 @@ STOPPED_SHARE = 0.5
 """Computing time of a simulated stop, relative to that of one arm on a path and its transitions."""
 
 RAISED_RATE = 1.6
-"""First higher rate tried in the search for one to recommend, relative to the configured rate."""
+"""First rate tried when searching for a higher one to recommend, relative to the configured rate."""
 
 ROOM = 1.2
 """Recommended extension of a limit, relative to the amount by which the simulated arms exceed the limit."""
@@ -60,7 +60,7 @@ LEAST_SPREAD_SHARE = 0.1
 
 @dataclass(frozen=True)
 class Found:
-    """A safe share of the amplitude, with its plan and the predicted motion."""
+    """A safe fraction of the amplitude, with its plan and the predicted motion."""
 
     share: float
     plan: Plan
@@ -71,8 +71,8 @@ class Found:
 class SafeShares:
     """The current belief about the arm, and the paths designed for it.
 
-    last: share of the previous run. cap: largest share after a run that exceeded a limit. Both are fractions of the
-    amplitude of `paths`, and are converted when these paths are replaced. tell: called with the progress of each
+    last: amplitude of the previous run. cap: largest amplitude after a run that exceeded a limit. Both are fractions of
+    the amplitude of `paths`, and are converted when these paths are replaced. tell: called with the progress of each
     simulation of the arms. designing: called with the progress of each path's design. trying: called with a description
     of each path and amplitude before it is simulated. simulated: motion simulated so far [s]. passed: on which sides of
     its rest angle each joint has been in a run, as in `resting_stops`.
@@ -102,13 +102,14 @@ class SafeShares:
         return self.belief.with_stabiliser(self.given)
 
     def safe(self, config: Config, shares: tuple[float, ...], most: float = np.inf) -> Found:
-        """Find the first of the `shares` of the designed path that is safe for all simulated arms.
+        """Find the first of `shares`, fractions of the designed path's amplitude, that is safe for all simulated arms.
 
-        most: largest allowed share; if `shares` begin with a larger one, all of them are scaled down in proportion. On
-        other paths, the share that gives the same amplitude is used instead.
+        most: largest allowed fraction; if `shares` begin with a larger one, all of them are scaled down in proportion.
+        On other paths, the fraction that gives the same amplitude is used instead.
 
-        If the safe share is small, other paths with more reserve are designed; the most informative safe one is kept.
-        If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.
+        If the safe fraction is small, other paths with more reserve are designed; the most informative safe one is
+        kept. If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no path is safe at any
+        amplitude.
         """
         self._path = 0
         found, why = self._safe_of_these(config, shares, most)
@@ -180,7 +181,7 @@ class SafeShares:
         return self._rescaled(former)
 
     def _rescaled(self, former: Paths) -> float:
-        """Convert the shares from the old paths to the new ones; return the ratio of their amplitudes."""
+        """Convert the fractions from the old paths to the new ones; return the ratio of their amplitudes."""
         times = self.paths.amplitude_over(former)
         self.last = self.last / times
         self.cap = min(self.cap / times, 1.0) if self.cap < 1.0 else 1.0
@@ -209,10 +210,10 @@ class SafeShares:
         return found, why
 
     def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
-        """Return the first safe share of the paths, why a larger one is unsafe, and the clearance that the larger one
-        lacks [m].
+        """Return the first safe fraction of the amplitude, why a larger one is unsafe, and the clearance that the
+        larger one lacks [m].
 
-        If neither the first share nor the last one, tried on few arms, is safe, those in between are not tried.
+        If neither the first fraction nor the last one, tried on few arms, is safe, those in between are not tried.
         """
         self._path += 1
         found, why, shortage = self._found(config, shares[0], f"amplitude 1 of at most {len(shares)}")
@@ -232,7 +233,7 @@ class SafeShares:
         return found, why, shortage
 
     def _found(self, config: Config, share: float, which: str) -> tuple[Found | None, str, float]:
-        """Return this share if it is safe, otherwise why it is not, and how much clearance it lacks [m]."""
+        """Return this fraction if it is safe, otherwise why it is not and how much clearance it lacks [m]."""
         shortage = 0.0
         for count in (SEARCH_ARMS, ARMS):
             found, why, lacking = self._unsafe(config, share, count, which)
@@ -244,8 +245,8 @@ class SafeShares:
         return (None if why else found), why, shortage
 
     def _unsafe(self, config: Config, share: float, count: int, which: str) -> tuple[Found | None, str, float]:
-        """Simulate a share on some arms; return the prediction, why the share is unsafe, and the clearance it lacks
-        [m].
+        """Simulate a fraction of the amplitude on some arms; return the prediction, why it is unsafe, and what
+        clearance it lacks [m].
         """
         if self.trying is not None:
             most = (1 + OTHER_SEEDS) * (1 + REDESIGNS)
@@ -261,7 +262,7 @@ class SafeShares:
         return Found(share, plan, foreseen), why, -float(foreseen.rooms.min())
 
     def _worth(self, paths: Paths, found: Found) -> float:
-        """Worst relative standard error of the base parameters with the found share of a path."""
+        """Worst relative standard error of the base parameters at the amplitude found for a path."""
         return paths.designer.worth(paths.designer.scaled(paths.identify, found.share))[0]
 
     def _unsafe_stop(self, config: Config, plan: Plan) -> str:
@@ -284,7 +285,7 @@ def _at_rate(config: Config, rate: float) -> Config:
 
 
 def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the shares, scaled so that the first is at most `most`."""
+    """Return the fractions, scaled so that the first is at most `most`."""
     return tuple(min(1.0, most / shares[0]) * share for share in shares)
 
 

@@ -79,7 +79,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
 
 
 def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -> Array:
-    """Largest torque (joints,) [N m] of the run after one that ended with `error` without exceeding a limit.
+    """Largest torque (joints,) [N m] of the next run, after `error` ended one that exceeded no limit.
 
     With little friction, a large motion may never settle; less torque helps. If torque hardly exceeds dry friction,
     however, friction stops the joint in a different place each time, and less torque would not move it at all.

@@ -51,7 +51,7 @@ def rehearse_in_steps(
 
 
 def _largest(held: Config, ensemble: Ensemble, executor: Executor | None) -> Amplitude | None:
-    """The largest torque that is safe for every arm; None if there is none and only the pilot can find it."""
+    """The largest torque that is safe for every arm; None if there is none, so that only the pilot can find one."""
     try:
         found = largest_amplitude(held, ensemble, executor=executor)
     except NoSafeTorque:

@@ -31,7 +31,7 @@ from hil.runs.run_folder import RunFolder
 DEFAULTS = PilotOptions()
 
 _LINES_FOR_DETECTION = 4
-"""Minimum number of spectral lines in the band per joint if experiment.detection leaves some of them unexcited."""
+"""Minimum number of spectral lines per joint in the band if experiment.detection leaves some lines unexcited."""
 
 
 @dataclass
@@ -150,8 +150,8 @@ class Search:
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
         """The largest amplitude that is safe for all plausible arms. share: fraction of each limit that they may use.
 
-        If there is none, the amplitude of the last run is used, provided that the real arm has shown it to be safe, and
-        otherwise a smaller one. Raises NoSafeTorque if there has been no run yet.
+        If there is no such amplitude, that of the last run is used, provided that the real arm has shown it to be safe,
+        and otherwise a smaller one. Raises NoSafeTorque if there has been no run yet.
         """
         ensemble, options = self.belief.ensemble(self._farther), self.options
         cap = self.cap

@@ -17,8 +17,9 @@ _FEWEST = 40  # smallest useful number of samples
 class Seen:
     """Commands and motion of a run.
 
-    command: torque without the stabiliser's share (joints, samples) [N m]. position: measured angles (joints, samples)
-    [rad], NaN where a reply is missing. pose: pose before the run (joints,) [rad]. end: last pose (joints,) [rad].
+    command: torque without the stabiliser's contribution (joints, samples) [N m]. position: measured angles (joints,
+    samples) [rad], NaN where a reply is missing. pose: pose before the run (joints,) [rad]. end: last pose (joints,)
+    [rad].
     """
 
     command: Array

@@ -33,9 +33,9 @@ _BESIDE = 2
 class Step:
     """One intermediate run.
 
-    name: name shown to the user. peak_torque: peak torques (joints,) [N m]. median, quantile: predicted peaks, as the
-    median and the 99 % quantile of the simulated arms; seen: measured peaks, each (quantities, joints) in the order of
-    hil.dry_run.prediction.QUANTITIES. ended: why the run ended early; empty if it did not.
+    name: name shown to the user. peak_torque: peak torques (joints,) [N m]. median, quantile, seen:
+    predicted peaks (median and 99 % quantile of the simulated arms) and measured peaks, each (quantities, joints) in
+    the order of hil.dry_run.prediction.QUANTITIES. ended: why the run ended early; empty if it did not.
     """
 
     name: str

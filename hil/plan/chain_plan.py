@@ -145,7 +145,7 @@ def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array |
 
 
 def check_rest_pose(config: Config) -> None:
-    """Raise ConfigError if, in the rest pose, parts of the arm would be inside each other, the floor or a box."""
+    """Raise ConfigError if, in the rest pose, parts of the arm would intersect each other, the floor or a box."""
     if wrong := Space.of(config).wrong_rest_pose():
         raise ConfigError(f"{config.path}: {wrong}.")
 
@@ -199,9 +199,7 @@ def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
 
 
 def _ways(config: Config, path: Path) -> tuple[Path, Path]:
-    """Transitions from the rest pose into the moving path and back; each joint stays between its rest angle and the
-    path.
-    """
+    """Transitions from rest to motion along the path and back; each joint stays between its rest angle and the path."""
     count = max(2, round(config.experiment.ramp * config.experiment.rate))
     samples = path.position.shape[1]
     before, after = np.arange(-count, 0) % samples, np.arange(count) % samples

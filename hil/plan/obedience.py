@@ -3,8 +3,9 @@
 While the torque is constant, a reversed motor cannot be distinguished from an external push: either way, the arm moves
 as if an additional torque acted on the joint. The goal of a suspect joint is therefore removed briefly, while the other
 goals are held. Unexplained torque that comes from the joint's own motor then falls in proportion to the motor's torque,
-through the same filter; torque from a push does not. If it falls earlier or later than that, the joint is tested again.
-The test is so short that an unpowered joint gains less speed from gravity than a reversed motor would give it.
+through the same filter; torque from a push does not. If the unexplained torque falls earlier or later, the joint is
+tested again. The test is so short that an unpowered joint gains less speed from gravity than a reversed motor would
+give it.
 """
 
 from collections.abc import Sequence
@@ -25,8 +26,8 @@ LONGEST_TEST_S = 0.06
 
 TURNED, PUSHED = 1.1, 0.7
 """Drop of the unexplained torque, relative to that of the joint's own torque, when its goal is removed: 2 for a
-reversed motor, less right after the reversal, 1 for a motor without torque, 0 for a push. The motor counts as reversed
-above the first limit, the joint as pushed up to the second; in between, it is tested again.
+reversed motor, less right after the reversal, 1 for a motor without torque, 0 for a push. Above the first limit, the
+motor counts as reversed; up to the second, the joint counts as pushed; in between, it is tested again.
 """
 
 MOST_TURNED = 3.0
@@ -38,8 +39,8 @@ unexplained torque has another cause.
 """
 
 MOST_UNEVEN = 3
-"""After this many consecutive tests in which the unexplained torque falls unevenly, it is attributed to the motor
-nevertheless.
+"""After this many consecutive tests in which the unexplained torque falls unevenly, it is nevertheless attributed to
+the motor.
 """
 
 MOVES_RAD_S = 0.1
@@ -49,7 +50,7 @@ motor may have become reversed right before that test.
 """
 
 PAUSE_S, PUSHED_PAUSE_S = 0.01, 0.25
-"""Time between two tests of a joint, and the time after a test that showed a push [s]."""
+"""Time between two tests of a joint, and waiting time after a test that showed a push [s]."""
 
 
 class Residual(NamedTuple):
@@ -84,7 +85,7 @@ class _Test:
         return (self.lacking - lacking) / (self.torque - torque) if torque != self.torque else 0.0
 
     def is_uneven(self, lacking: float, torque: float) -> bool:
-        """Whether the unexplained torque has not dropped in proportion to the joint's own."""
+        """Whether the unexplained torque has not dropped in proportion to the joint's own torque."""
         assert self.lacking is not None
         share, most = self.share(lacking, torque), UNEVEN * abs(self.lacking - lacking)
         return share > MOST_TURNED or any(
@@ -122,7 +123,7 @@ class Obedience:
         return True
 
     def suspect(self, found: Residual, velocity: Sequence[float], now: float) -> None:
-        """Begin the tests that the latest exchange calls for. velocity: believed velocities [rad/s]. now: time of that
+        """Begin the tests that the latest exchange calls for. velocity: trusted velocities [rad/s]. now: time of that
         exchange [s].
         """
         for joint, (lacking, torque) in enumerate(zip(found.lacking, found.torque, strict=True)):

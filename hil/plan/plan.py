@@ -1,4 +1,4 @@
-"""The excitation plan: the multisines of an experiment as goal currents, sample by sample, ramps included."""
+"""The excitation plan: the multisines of an experiment as goal currents, sample by sample, including ramps."""
 
 import math
 from collections.abc import Callable, Sequence

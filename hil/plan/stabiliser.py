@@ -82,8 +82,8 @@ class Stabiliser:
 def too_slow(config: Config) -> str:
     """Explain why the rate is too low for the stabiliser, and what to do; "" if it is high enough.
 
-    A spring that acts `delay` late drives the motion like a negative damper of stiffness times `delay`. The joint
-    oscillates unless the configured damping and the servo's typical viscous friction together outweigh it.
+    A spring whose torque is late by `delay` drives the motion like a negative damper of stiffness times `delay`. The
+    joint oscillates unless the configured damping and the servo's typical viscous friction together outweigh it.
     """
     if config.stabiliser is None:
         return ""
@@ -120,7 +120,7 @@ def feedback_of(config: Config) -> Feedback:
 
 
 def stabiliser_share(config: Config, samples: NDArray[np.void]) -> StabiliserShare:
-    """The stabiliser's share of the torque in consecutive rows of a recording, from one multisine."""
+    """The stabiliser's contribution to the torque in consecutive rows of a recording, from one multisine."""
     torque = feedback_torque(config, samples)
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     commanded = samples["goal_current"][1:] * constants

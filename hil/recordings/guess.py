@@ -62,7 +62,7 @@ def guessed(table: Table, columns: Columns) -> Columns:
 
 
 def said(columns: Columns, table: Table) -> str:
-    """Sentences about how the columns were interpreted, and which were not used."""
+    """Say how the columns were interpreted and which were not used."""
     drive = columns.drive or "torque"
     time = _described("time", [columns.time], columns, table) if columns.time else f"{columns.rate:g} samples a second"
     position = _described("position", columns.position or [], columns, table)
@@ -135,7 +135,7 @@ def _spaced(name: str) -> str:
 
 
 def _stem(name: str) -> str:
-    """The part of a column's name that all joints share: all except the joint's number, or all before the last dot."""
+    """A column's name without its number or, failing that, without its last dotted part or a joint's name."""
     numbered = re.sub(r"\d+", "#", name)
     if numbered != name:
         return numbered
@@ -186,7 +186,7 @@ def _quoted(name: str) -> str:
 
 
 def _kind(name: str, words: str) -> str:
-    """The kind of column that its name suggests: "other" if certainly not needed, "unknown" if the name is unclear."""
+    """The kind of column that a name suggests: "other" if certainly not needed, "unknown" if the name is unclear."""
     if _TIME.fullmatch(_last(name)):
         return "time"
     found = next((kind for kind, pattern in _KINDS.items() if pattern.search(words)), "unknown")

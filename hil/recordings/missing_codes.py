@@ -7,7 +7,7 @@ from hil.estimator.arrays import Array
 CODES = tuple(
     sign * code for code in (99.0, 999.0, 9999.0, 99999.0, 999999.0, 32767.0, 65535.0) for sign in (-1.0, 1.0)
 )
-"""Usual codes for missing values; 32767 and 65535 are the largest signed and unsigned 16-bit values."""
+"""Common codes for missing values; 32767 and 65535 are the largest signed and unsigned 16-bit values."""
 
 FEWEST = 2
 APART = 2.0
@@ -17,7 +17,7 @@ APART = 2.0
 def without_codes(values: Array) -> tuple[Array, float | None]:
     """Replace a code for missing values by NaN; return the values and the code, which is None if there is none.
 
-    A number is a code only if it is a usual one, repeats exactly, and lies far from all other values.
+    A number is a code only if it is a common one, repeats exactly, and lies far from all other values.
     """
     known = values[np.isfinite(values)]
     for code in CODES:

@@ -20,7 +20,7 @@ class Table:
 
     columns: values (rows,) by name, NaN where a value is missing and infinite where it is not a number. units: units
     stated in the file, by column. first_row: number of the first row, for messages (a CSV file's header is line 1).
-    texts: the first value of each column that is not a number, as written in the file.
+    texts: first non-numeric entry of each column that has one, as written in the file.
     """
 
     source: str

@@ -324,7 +324,7 @@ class StabiliserShare:
         return tuple(rms / max(whole, 1e-12) for rms, whole in zip(self.rms, self.commanded_rms, strict=True))
 
     def said(self, names: Sequence[str]) -> str:
-        """A sentence about the stabiliser's share of the torque, with these joint names."""
+        """A sentence about the stabiliser's contribution to the torque, with these joint names."""
         each = ", ".join(
             f"{name} {rms:.3f} of {whole:.3f} N m RMS ({100 * part:.0f} %, peak {peak:.3f})"
             for name, rms, whole, part, peak in zip(
@@ -338,7 +338,7 @@ class StabiliserShare:
 class PlayedStep:
     """One step of a pilot on the way to full amplitude, with its predicted and measured peaks.
 
-    The rows of predicted and measured peaks are the quantities of hil.dry_run.prediction.QUANTITIES, the columns are
+    The rows of predicted and measured peaks are the quantities of hil.dry_run.prediction.QUANTITIES; the columns are
     the joints. peak_torque: peak torque per joint [N m]. ended: why the run ended early; None if it did not.
     """
 

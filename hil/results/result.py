@@ -17,9 +17,9 @@ chain        only for a spatial arm: its geometry, and the combination that each
 truth        only on a fake arm: the base parameters it was built with, for the true torque constants of its motors
 truth_scaled `truth` scaled to the file's torque constants, like `parameters`; only if the motors' constants differ
 physical     masses, centres and inertias, if [known] gives any quantity
-stabiliser   with a stabiliser: its share of the torque
+stabiliser   with a stabiliser: its contribution to the torque
 steps        with a pilot: predicted and measured peaks of each step
-zeros, recordings, notes   only for recordings made elsewhere; notes: what was guessed, corrected or averaged
+zeros, recordings, notes   only for recordings by other tools; notes: what was guessed, corrected or averaged
 """
 
 import math
@@ -138,7 +138,7 @@ class SettledResult(Result):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ShootingResult(Result):
-    """Result of multiple shooting on arbitrary motion: recordings made elsewhere, and runs without a settled period."""
+    """Result of multiple shooting on arbitrary motion: recordings by other tools, and runs without a settled period."""
 
     fit: ShootingFit
     zeros: tuple[Zeros, ...] | None = None

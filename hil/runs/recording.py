@@ -49,8 +49,8 @@ def sample_type(joints: int) -> np.dtype[np.void]:
 
     It contains times [s], phase, segment and period of the experiment, and, for each joint, goal and measured current
     [A], velocity [rad/s], position [rad], the servo's error byte and whether its reply is missing (the measured values
-    are then NaN). A few times a second, it also contains either the servo's clock [s] or its supply voltage [V] and
-    temperature [degrees C], in turn; these are NaN in all other rows.
+    are then NaN). A few times a second, it also contains, alternately, the servo's clock [s] or its supply voltage
+    [V] and temperature [degrees C]; these are NaN in all other rows.
     """
     each = (joints,)
     return np.dtype(

@@ -1,4 +1,4 @@
-"""The run folder: an exact copy of the configuration, versions and machine, events, samples, result.
+"""The run folder: configuration (an exact copy), versions and machine, events, samples, result.
 
 config.toml     copied byte for byte
 experiment.json the [experiment] table as run, if hil chose it (pilot, torque found by dry runs)

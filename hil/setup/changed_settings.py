@@ -62,8 +62,8 @@ _AT_A_LIMIT = frozenset({Cause.POSITION, Cause.VELOCITY})
 """Causes of a stop that excessive torque by itself can explain."""
 
 _MODES_SEEN_S = 0.06
-"""If the operating modes were read back less than this time [s] before a stop, a changed mode may have been changed
-after the stop.
+"""If the operating modes were read back less than this time [s] before a stop, a mode that differs may have been
+changed after the stop.
 """
 
 Settings = Mapping[tuple[Joint, str], int]
@@ -74,7 +74,7 @@ def settings_now(bus: ServoBus) -> Settings:
 
     Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
     to an earlier request. If the two readings differ, the value is unknown and omitted, as are all values of a
-    servo whose ID is read wrongly: its replies are late, and equal values may be those of other registers.
+    servo whose ID is read wrongly: its replies are late, so even equal values may be those of other registers.
     """
     found: dict[tuple[Joint, str], int] = {}
     report = bus.torque_off_report

@@ -144,7 +144,7 @@ def _joint(answers: JointAnswers) -> list[str]:
 
 
 def _spread(published: Published) -> float:
-    """Standard deviation of a published constant: half the range of published values, at least a tenth of the value."""
+    """Standard deviation of a published constant: half the published range, but at least a tenth of the value."""
     return max(0.1 * published.value, (published.high - published.low) / 2)
 
 
@@ -185,7 +185,7 @@ def _rate_meaning(arm: ArmAnswers) -> str:
 
 
 def _exchange(arm: ArmAnswers) -> list[str]:
-    """Return the [port] settings of the measured rate that differ from the defaults."""
+    """Return the [port] settings, other than the defaults, that the measured rate requires."""
     if arm.measured is None:
         return []
     one_write = [] if arm.measured.one_write else [_line("one_write = false", "this bus is faster with two writes")]

@@ -149,7 +149,7 @@ def _name(number: int, found: Found, ask: Ask) -> str:
 def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
     """Determine in which direction Present Position increases; return +1 if counter-clockwise, otherwise -1.
 
-    The arm is viewed so that it hangs down, and points to the right when lifted.
+    This is as seen by a viewer for whom the hanging arm points to the right when it is lifted.
     """
     before = servo.read("Present Position")
     given = {"1": 1, "+1": 1, "-1": -1}

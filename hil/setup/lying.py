@@ -23,7 +23,7 @@ NEAR_RAD = 0.02
 """Deviation up to which arm.rest_pose is used although the arm is not exactly there [rad]."""
 
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
-"""Smallest reported motion after torque off, and largest deviation from the rest pose before that motion [rad]."""
+"""Smallest reported motion after torque is cut, and largest deviation from the rest pose before that motion [rad]."""
 
 _LONGEST_SAG_S = 3.0  # wait for an arm that moves after torque off
 

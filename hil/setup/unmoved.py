@@ -17,7 +17,7 @@ MOST_RAD = 0.05
 """Largest motion allowed before torque is switched on [rad]; the guard allows the same before the start."""
 
 STIRRED_RAD = 0.004
-"""Motion that encoder noise cannot explain [rad]: the arm is not at rest."""
+"""Smallest motion that encoder noise cannot explain [rad]: the arm is then not at rest."""
 
 Lies = Mapping[Joint, int]
 """Present Position of each servo [ticks]."""

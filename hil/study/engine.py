@@ -39,8 +39,8 @@ _ADDRESS = re.compile(r"([a-z]+://)?[^\s/]+:\d{1,5}")
 _PACKAGES = ("numpy", "scipy", "numba", "distributed")
 _CONNECT_S = 10.0
 _MOST_DEATHS = 10
-"""Number of worker losses during one run after which it counts as failed, since a run that needs too much memory kills
-every worker that tries it."""
+"""Number of worker losses after which a run counts as failed, since a run that needs too much memory kills every worker
+that tries it."""
 
 
 @contextmanager

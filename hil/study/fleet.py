@@ -52,7 +52,10 @@ class FleetArm:
 
 @dataclass(frozen=True)
 class Fleet:
-    """Comparison of the arms of one type. spreads, unlike (outliers, largest first): empty for too few arms."""
+    """Comparison of the arms of one type.
+
+    unlike: outliers, the largest first. This and `spreads` are empty for too few arms.
+    """
 
     type: str
     arms: tuple[FleetArm, ...]

@@ -1,5 +1,5 @@
-"""The folder of a study: only one process at a time works in it, and it can only be continued with the inputs and
-versions it was started with.
+"""The folder of a study. Only one process at a time works in it, and the study can be continued only with its original
+inputs and versions.
 
 DIR/study.toml   an exact copy of the study
 DIR/about.json   number of runs, seed, versions, hashes of the arm's file and of the recordings

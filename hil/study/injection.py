@@ -1,6 +1,4 @@
-"""A run with faults: whether the experiment continued or was stopped, why, with what delay, and how far the arm
-moved.
-"""
+"""Run an experiment with faults; report whether it was stopped, why, after what delay, and how far the arm moved."""
 
 from pathlib import Path
 from typing import Any

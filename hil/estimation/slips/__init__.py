@@ -1,1 +1,1 @@
-"""Horns and encoders that slipped: jumps of the position, and a rest position that changed."""
+"""Detection of slipped horns and encoders, from jumps of the position or a changed rest position."""

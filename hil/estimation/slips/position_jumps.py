@@ -1,4 +1,4 @@
-"""Jumps of a position that its velocity does not explain: an encoder that slipped, or a horn that moved on its shaft.
+"""Position jumps that the velocity does not explain: an encoder slipped, or a horn moved on its shaft.
 
 The guard stops a run at once if a position changes by more than the joint can move; a smaller jump merely shifts all
 later readings.
@@ -39,7 +39,7 @@ def jump_warnings(config: Config, facts: RunFacts, samples: NDArray[np.void]) ->
 
 
 def jump_disturbances(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tuple[str, ...]:
-    """A sentence for the verdict that names the joints whose position jumped, if any.
+    """Name the joints whose position jumped, in a sentence for the verdict; () if there are none.
 
     Jumps after the last multisine are ignored: nothing after it is used.
     """

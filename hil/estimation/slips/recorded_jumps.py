@@ -1,7 +1,7 @@
 """Jumps of a recorded position that no smooth motion explains, for recordings without a velocity.
 
 Around each interval between samples, a cubic with a step is fitted to the positions; the step is compared with those
-found elsewhere.
+at other intervals.
 """
 
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ def recorded_jumps(recordings: Sequence[Recording]) -> list[Jump]:
 def jump_sentences(
     recordings: Sequence[Recording], names: Sequence[str], stepped: Sequence[bool], joints: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """One sentence for each joint of each recording whose position jumped.
+    """One sentence for each joint whose position jumped in a recording.
 
     names: names of the recordings. stepped: whether each joint's encoder step is known. joints: names of the joints.
     """
@@ -95,7 +95,7 @@ def _jumps(recording: Recording, joint: int) -> list[tuple[float, float]]:
 
 
 def _steps(time: Array, position: Array, uneven: Mask) -> Array:
-    """The step in the middle of every window of 2 SIDE samples [rad]. `uneven`: where intervals are unequal."""
+    """The step [rad] in the middle of each window of 2 * SIDE samples. uneven: where intervals are unequal."""
     windows = np.lib.stride_tricks.sliding_window_view
     sizes = np.correlate(position, _weights(np.arange(2.0 * SIDE)[None, :])[0], mode="valid")
     places = np.flatnonzero(uneven)
@@ -107,7 +107,7 @@ def _steps(time: Array, position: Array, uneven: Mask) -> Array:
 
 
 def _weights(time: Array) -> Array:
-    """Weights (windows, 2 SIDE) whose products with the positions at `time` (same shape) sum to the step."""
+    """Weights (windows, 2 * SIDE) that, applied to the positions at `time` (same shape), give the step."""
     at = time - 0.5 * (time[:, SIDE - 1 : SIDE] + time[:, SIDE : SIDE + 1])
     at = at / (time[:, -1:] - time[:, :1])
     design = np.stack((*(at**order for order in range(ORDER + 1)), at > 0.0), axis=-1)

@@ -18,7 +18,7 @@ LEAST_RAD = 0.1
 """Smallest shift that is reported [rad]."""
 
 _FRICTION_TIMES = 2.0
-"""Multiple of the servo's typical breakaway friction that can hold a joint away from where it would hang."""
+"""Multiple of the servo's typical breakaway friction that can hold a joint away from its hanging position."""
 
 _STILL_RAD = 0.02
 """Range of positions within which an arm counts as resting [rad]."""
@@ -27,7 +27,7 @@ _STILL_RAD = 0.02
 def rest_shift_warnings(config: Config, samples: NDArray[np.void], result: SettledResult) -> list[str]:
     """One sentence per joint whose rest angle changed by more than friction usually explains.
 
-    Nothing is reported if the verdict trusts the model, or if the arm is horizontal or held by a stabiliser.
+    Nothing is reported if the verdict is "yes", or if the arm is horizontal or held by a stabiliser.
     """
     trusted = result.verdict is not None and result.verdict.trust == "yes"
     if trusted or config.arm.gravity == 0.0 or config.stabiliser is not None or config.is_chain:
@@ -58,7 +58,7 @@ def _gravity(result: SettledResult, pose: Array) -> Array:
 
 
 def _resting(config: Config, samples: NDArray[np.void], phase: Phase) -> Array | None:
-    """Median of the last positions of a phase (joints,) [rad]; None if a joint has none or is still moving."""
+    """Median of the last positions of a phase (joints,) [rad]; None if a joint has no positions or is still moving."""
     rows = samples[samples["phase"] == phase][-rest_window(config.experiment.rate) :]
     position = rows["position"]
     if not len(rows) or not np.isfinite(position).any(axis=0).all():

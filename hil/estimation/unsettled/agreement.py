@@ -54,7 +54,7 @@ def _separately(
 
 
 def _differences(alone: Sequence[ShootingEstimate], names: Sequence[str]) -> list[str]:
-    """The base parameters whose values are farthest apart in standard deviations, with both values."""
+    """The base parameters whose values differ most, in standard deviations, each with its lowest and highest value."""
     found = []
     for index, name in enumerate(alone[0].model.base_names):
         if kind_of(name) == "offset":

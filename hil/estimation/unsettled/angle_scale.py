@@ -1,9 +1,10 @@
 """Detection of angles with a wrong scale: an encoder resolution, belt ratio or gear ratio other than the stated one.
 
 A joint's equation is linear in its angle except for gravity, so only gravity reveals the scale. Near the angle at which
-the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, a weaker gravity and a spring: with a
+the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, i.e. weaker gravity plus a spring: with a
 spring, an offset and an encoder zero, a fit explains angles with a wrong scale s down to the noise, but with wrong
-values. So if a fit finds a spring, the motion is fitted again without it, but with the scale that would imitate it.
+values. So if a fit finds a spring, the motion is fitted again without a spring but with the scale that would imitate
+one.
 """
 
 import math
@@ -54,7 +55,7 @@ def angle_scale(
 def _candidate(recordings: Sequence[Recording], estimate: ShootingEstimate, about: Array) -> _Scale | None:
     """The scale of the first joint that would imitate the spring of the estimate.
 
-    Scales of other joints change the effect of these joints on the first one, which no spring can imitate.
+    No spring can imitate a wrong scale of another joint, which changes that joint's effect on the first one.
     """
     value, names = estimate.parameters, list(estimate.names)
     if SPRING not in names or not value["gravity_1"] > 0.0:
@@ -112,7 +113,7 @@ def _fitted(
 
 
 def _scaled(recordings: Sequence[Recording], factor: Array, about: Array) -> list[Recording]:
-    """The recordings with angles relative to `about` (joints,) [rad] divided by `factor` (joints,)."""
+    """The recordings, with each angle's distance from `about` (joints,) [rad] divided by `factor` (joints,)."""
     centre = about[:, None]
     return [
         replace(

@@ -19,9 +19,9 @@ CHANGES = ("step", "linear", "decay")  # courses of defects within a recording
 
 @dataclass(frozen=True)
 class Fitted:
-    """Fits of recordings. names: names of the recordings. predicted: simulated positions of each (joints, samples)
-    [rad]. plain: estimate of a model without terms that could imitate a defect. estimate: estimate of the chosen model.
-    gravity: gravity in the arm's plane [m/s^2]. repeats: whether each recording is the mean of similar periods.
+    """Fits of recordings. predicted: simulated positions of each recording (joints, samples) [rad]. plain: estimate of
+    a model without terms that could imitate a defect. estimate: estimate of the chosen model. gravity: gravity in the
+    arm's plane [m/s^2]. repeats: whether each recording is the mean of similar periods.
     """
 
     recordings: Sequence[Recording]

@@ -51,7 +51,7 @@ class ChainEstimated:
 def estimate_chain_recordings(
     recordings: Sequence[Recording], config: RecordingConfig, shown_path: str, source: str
 ) -> ChainEstimated:
-    """Estimate a spatial arm from recordings. source: their files, for messages.
+    """Estimate a spatial arm from recordings. source: names their files in messages.
 
     Raises ConfigError, CsvError, ArmFileError, EstimationError.
     """
@@ -114,7 +114,7 @@ def estimate_chain_recordings(
 
 
 def _drive(config: RecordingConfig, joints: int) -> Drive:
-    """The drive model of the file; by default, for several joints, a common delay and a separate lag for each.
+    """The configured drive model; by default, for several joints, a common delay and a separate lag for each.
 
     Other tools' recordings may contain both, and a delay does not explain lags that differ between joints.
     """
@@ -143,7 +143,7 @@ def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescripti
 def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior, contradictory: bool) -> RecordedChain:
     """The fit. contradictory: whether the torques seem to contradict each other.
 
-    If so, their ratios are fitted too, unless the fit finds that the torques agree; a regression does not fit ratios.
+    If so, and if torques are held between samples, their ratios are fitted too, but dropped if the torques then agree.
     """
     if contradictory and all(each.between == "held" for each in recordings):
         found = identify_recordings(recordings, replace(model, torque_scale=True), prior)

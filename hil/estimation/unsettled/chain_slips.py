@@ -1,4 +1,4 @@
-"""Mistakes in the columns of a spatial arm's recording: clear ones are refused, others are left to the fit."""
+"""Mistakes in the columns of a spatial arm's recording: clear ones raise CsvError, others are left to the fit."""
 
 from collections.abc import Sequence
 

@@ -40,7 +40,7 @@ def is_other_arm(defect: Defect) -> bool:
 
 
 def defect_said(defect: Defect, names: Sequence[str]) -> str:
-    """A sentence about a defect, with the evidence and a remedy. names: names of the recordings."""
+    """A sentence about a defect, with the evidence and a remedy."""
     hypothesis = defect.hypothesis
     unknowns = defect.fit.unknowns[-hypothesis.unknowns :].tolist()
     what, remedy = _WORDS[hypothesis.kind](hypothesis, unknowns, _when(hypothesis.course, names))

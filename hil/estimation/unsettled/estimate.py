@@ -117,7 +117,7 @@ def estimate_any(
     stepped: Sequence[bool] = (),
     given: Given = Given(),
 ) -> Estimated:
-    """The estimate, its checks and its verdict. stepped: whether each joint's encoder step is known; by default it is.
+    """The estimate, its checks and its verdict. stepped: whether each joint's encoder step is known (the default).
     given: prior knowledge, with which the estimate is compared.
 
     Raises ConfigError, EstimationError.

@@ -1,6 +1,6 @@
-"""Location and kind of the parts of a recording that the fitted model fails to explain, unlike the rest.
+"""Locate and classify the parts of a recording that the fitted model explains much worse than the rest.
 
-These are frozen readings, missing torques, single wrong samples, and stops.
+The kinds are frozen readings, missing torques, single wrong samples, and stops.
 """
 
 from collections.abc import Iterator, Sequence
@@ -53,8 +53,8 @@ def local_defects(
 ) -> tuple[str, ...]:
     """One sentence for each local defect, for a fit that leaves much of the motion unexplained.
 
-    predicted: simulated positions of each recording (joints, samples) [rad]. window: length over which residuals are
-    compared [s].
+    predicted: simulated positions of each recording (joints, samples) [rad]. window: length of the parts whose
+    residuals are compared [s].
     """
     joints = list(_joints(recordings, names, predicted, window))
     return tuple(

@@ -1,4 +1,4 @@
-"""Detection of values from imported recordings that are impossible for a servo arm, usually because of a wrong unit."""
+"""Detection of values that no servo arm can have, usually due to a wrong unit in an imported recording."""
 
 import math
 from collections.abc import Sequence
@@ -32,9 +32,7 @@ def implausible(recordings: Sequence[Recording], estimate: ShootingEstimate, gra
 
 
 def undetermined(estimate: ShootingEstimate) -> list[str]:
-    """One sentence naming the terms that are undetermined, because their standard errors are as large as their
-    values.
-    """
+    """One sentence naming the terms that are undetermined: their standard errors are as large as their values."""
     found = [
         f"{name} ({value:.3g} +- {std:.2g})" if std < math.inf else f"{name} (not at all)"
         for name, value, std in zip(estimate.names, estimate.value, estimate.std, strict=True)

@@ -126,7 +126,7 @@ def _once(sentences: Iterable[Sequence[str]]) -> tuple[str, ...]:
 
 
 def _doubted(result: ShootingResult, read: Converted) -> ShootingResult:
-    """The result with the doubts about the columns added to its verdict."""
+    """The result, with doubts about the columns added to its verdict."""
     verdict = result.verdict
     if not read.doubts or verdict is None:
         return result
@@ -135,7 +135,7 @@ def _doubted(result: ShootingResult, read: Converted) -> ShootingResult:
 
 
 def _zeroed(read: Converted, gravity: float) -> Converted:
-    """Measure angles from the horizontal, if their origin is not given but can be determined from gravity."""
+    """Measure angles from the horizontal if their origin is not given but can be determined from gravity."""
     if gravity <= 0.0 or read.columns.zero is not None:
         return read
     zeros = turned_zeros(read.recordings)

@@ -1,4 +1,4 @@
-"""Rejection of recordings with a clear mistake in their columns: an estimate would take a minute and be useless."""
+"""Rejection of recordings with a clear mistake in their columns: an estimate would take a minute but be useless."""
 
 import math
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ from hil.estimator.baselines.signs import (
 from hil.estimator.data.recording import Recording
 
 CLEAR = 0.25
-"""A mistake is clear only if its correction reduces the torque residual to less than this fraction of its value."""
+"""A mistake is clear only if correcting it multiplies the torque residual by less than this factor."""
 
 NEARLY_ALL = 0.9  # fraction of the segments
 STUCK_STEPS = 10.0  # motion in encoder steps below which a joint sticks
 SAME_ANGLE = 0.01  # rad
 
 WELL = 0.3
-"""A mistake is clear only if the torque residual after its correction is less than this fraction of the RMS torque."""
+"""A mistake is clear only if correcting it leaves a torque residual of less than this fraction of the RMS torque."""
 
 
 def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None = None) -> None:
@@ -71,7 +71,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
 def refuse_stuck(recordings: Sequence[Recording], source: str, segment: float) -> None:
     """Raise CsvError if a joint hardly moves in nearly all segments of length `segment` [s].
 
-    Its encoder then shows little but friction, whose fit would take minutes.
+    Its encoder then shows little but friction, which would take minutes to fit.
     """
     for joint in range(recordings[0].joints):
         steps = [
@@ -88,7 +88,7 @@ def refuse_stuck(recordings: Sequence[Recording], source: str, segment: float) -
 
 
 def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None) -> None:
-    """Raise CsvError if the angle of joint 2 is absolute; the message gives the new zero if that changes."""
+    """Raise CsvError if the angle of joint 2 is absolute; the message includes the zero if it must change too."""
     joints = recordings[0].joints
     free = suspect_absolute_unzeroed(recordings) if zero is None else None
     zero = zero or (0.0,) * joints

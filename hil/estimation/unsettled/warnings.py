@@ -1,4 +1,4 @@
-"""Warnings about an estimate from unsettled data, each with the joint and a remedy."""
+"""Warnings about an estimate from unsettled data; each names the joint and a remedy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ UNITS_ADVICE = "check the units, signs and zero of position and torque; then try
 
 @dataclass(frozen=True)
 class Doubts:
-    """Findings, as sentences. faults: the estimate is unusable; doubts: it may be wrong; warnings: worth knowing."""
+    """Sentences: faults make the estimate unusable, doubts mean that it may be wrong, warnings are for information."""
 
     faults: tuple[str, ...]
     doubts: tuple[str, ...]
@@ -77,7 +77,7 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
 
 
 def _rows(recordings: Sequence[Recording]) -> list[str]:
-    """Detect rows that are missing from regular time steps, apart from gaps."""
+    """Detect rows that are missing from otherwise regular time steps, apart from gaps."""
     steps = [np.diff(each.time)[np.diff(each.time) < each.longest_interval] / each.interval for each in recordings]
     step = np.concatenate(steps)
     whole = np.round(step)

@@ -1,8 +1,8 @@
 """Check that the servos of one joint turn together.
 
 A horn that slips, a loose screw or a broken gear lets one servo turn without the other. The joint's angle, taken from
-the first servo, does not show this. The difference between their angles is compared with its value at the first sample,
-because horns may be mounted at any angle.
+the first servo, does not show this. The difference between the servos' angles is compared with its value at the first
+sample, because horns may be mounted at any angle.
 """
 
 from collections.abc import Sequence

@@ -6,12 +6,12 @@ velocity must equal the change in position. The difference,
     apart = position - integral of velocity,
 
 is tracked with three fading memories (leaky integrators): a short one, which reveals a sudden fault at once; a long
-one, which reveals a gradual fault; and a slow one, which reveals creep. Rounding of positions and encoder noise do not
+one, which reveals a gradual fault; and a slow one, which reveals creep. Encoder noise and rounding of positions do not
 accumulate in this difference. The contributions of a healthy servo are known:
 
 - a velocity that lags by tau, because the servo filters it: tau times (velocity minus its mean over the memory). Any
   lag up to `LAG_S` is accepted;
-- a velocity with a scale error: that fraction of the distance covered within the memory, at most `SCALE`;
+- a velocity with a scale error: the same fraction of the distance covered within the memory, at most `SCALE`;
 - a velocity that is rounded towards zero, or always downwards (which of the two a servo does is unknown). In the slow
   memory, this adds one register step times the excess of time in one direction over the other, or a bias of up to half
   a step times the time in motion, unless the motion so far rules it out (`hil.experiment.velocity.bias`). While the
@@ -31,8 +31,8 @@ Lag and scale error are properties of a servo and do not change. A lag that chan
 (`hil.experiment.velocity.lag`). Once the motion has revealed lag and scale error, up to twice the estimated values are
 accepted, plus `MORE_LAG_S` and `MORE_SCALE` and twice their standard deviations.
 
-The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). The state that it keeps for
-a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). Its state for a joint is a
+record of type `MEMORY`.
 """
 
 from collections.abc import Iterable
@@ -66,8 +66,8 @@ STDS = 2.0
 """Number of standard deviations by which the estimates of lag and scale error may be wrong."""
 
 BIAS_LAG_S, BIAS_SCALE, BIAS_LAG_SHARE = 0.002, 0.005, 0.1
-"""Further errors assumed for the estimates of lag and scale error, besides their standard deviations, when checking for
-creep [s, 1]. The last is relative to the lag times the range of velocities, since a filter is not a pure delay.
+"""Errors that are added to the standard deviations of lag and scale error when checking for creep [s, 1], and the
+allowance for a lag that is not a pure delay, as a fraction of the lag times the range of velocities.
 """
 
 _LAG_SHARE = 0.25
@@ -87,8 +87,8 @@ latest three values span `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
-"""Velocity below which readings may stay the same while a joint sticks and slips, and resolution of the readings
-[rad/s].
+"""Velocity below which readings may stay the same while a joint sticks and slips, and the resolution of the
+readings [rad/s].
 """
 
 LONGEST_GAP_S = 0.06
@@ -104,8 +104,8 @@ samples per period, the fastest that is used, needs 0.27.
 
 ROUGH_TIMES = 2.0
 """Allowance of the slow memory for a velocity that jumps between samples, as when gear teeth change sides: a multiple
-of the root sum of squares of `CURVED` times the difference between successive changes, times the interval. A jump
-within an interval causes an RMS error of 0.29 times the jump times the interval, and counts twice.
+of the root sum of squares of `CURVED` times the interval times the difference between successive velocity changes. A
+jump within an interval causes an RMS error of 0.29 times the jump times the interval, and counts twice.
 """
 
 CURVED_AT_FIRST = 0.3
@@ -162,11 +162,11 @@ MEMORY = np.dtype(
 position, velocity, turn: latest values, and latest change of velocity [rad, rad/s]; the position is NaN before the
 first one and after a long gap. seconds, moved, difference, unknown, most_curved: sums (for the last one, the maximum)
 since the long memory was last updated. seen: `difference` without motion that the velocity register cannot show.
-headed: time of motion in the positive minus that in the negative direction since then [s]. rough: sum of squares of the
-errors that velocity jumps may cause in each interval since then [rad^2]. heading, roughness: the same two in the slow
-memory. moving: time in motion there [s]. learnt: information from which lag and scale error were estimated [rad^2/s].
-lag, scale: their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the sums from
-which lag and scale error are estimated.
+headed: time of motion in the positive direction minus that in the negative one since then [s]. rough: sum of squares of
+the errors that velocity jumps may cause in each interval since then [rad^2]. heading, roughness, moving: in the slow
+memory, `headed`, `rough` and the time in motion [s]. learnt: information from which lag and scale error were estimated
+[rad^2/s]. lag, scale: their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the
+sums from which lag and scale error are estimated.
 """
 
 
@@ -263,7 +263,7 @@ def moved_at_standstill(states: Iterable[State], joint: int, still: float) -> st
 def check_standstill(name: str, states: Iterable[State], joint: int, still: float) -> None:
     """Raise SafetyStop if a joint moved while its velocity was reported to be below `still` [rad/s].
 
-    name: name of the joint. states: as in `moved_at_standstill`.
+    states: as in `moved_at_standstill`.
     """
     states = list(states)
     if moved := moved_at_standstill(states, joint, still):
@@ -391,8 +391,8 @@ def _add(
 ) -> None:
     """Add one interval of `seconds`, at the end of which the joint has `velocity`.
 
-    moved, difference: change of position, and the same minus the integral of velocity [rad]. curved, unknown:
-    uncertainties of these [rad]; only the second accumulates.
+    moved, difference: change of position, and this minus the integral of velocity [rad]. curved, unknown: uncertainties
+    of the difference [rad]; only `unknown` accumulates.
     """
     kept = 1.0 - seconds / time_constant if seconds < time_constant else 0.0
     new = 1.0 - kept

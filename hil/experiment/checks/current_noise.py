@@ -1,4 +1,4 @@
-"""Noise of the current readings, measured while the arm rests, and what it means for the check of the current.
+"""Noise of the current readings, measured while the arm rests, and its effect on the check of the current.
 
 The thresholds of `following` assume no more noise than usual. A noisier sensor gets wider thresholds, so that a healthy
 motor is not stopped.
@@ -20,10 +20,10 @@ from hil.experiment.checks import following
 __all__ = ["CurrentNoise", "NoiseAllowance", "Noisy"]
 
 FEWEST_READINGS, MOST_READINGS = 8, 256
-"""Number of readings from which noise is first measured, and number of the latest ones that are kept."""
+"""Number of readings from which noise is first measured, and number of latest readings that are kept."""
 
 _UNCERTAIN = 1.9
-"""Largest underestimate of noise measured from n readings, relative to the true noise, times sqrt(n)."""
+"""Largest underestimate of noise measured from n readings, as a multiple of the true noise divided by sqrt(n)."""
 
 _MAD_TO_SIGMA = 1.4826
 """Ratio of standard deviation to median absolute deviation of a normal distribution."""
@@ -73,9 +73,10 @@ class CurrentNoise:
 
 @dataclass(frozen=True)
 class Noisy:
-    """A joint whose current reading is noisier than usual; `said` reports this and its consequence.
+    """A joint whose current reading is noisier than usual.
 
-    refused: why the joint cannot be monitored, and what to do; "" if it can.
+    said: the noise and its consequence, as text. refused: why the joint cannot be monitored, and what to do; "" if it
+    can.
     """
 
     index: int

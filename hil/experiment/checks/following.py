@@ -14,20 +14,20 @@ goals, because a reply may be measured before or after the motor follows the lat
 error of `GAIN_ERROR`.
 
 Successive errors may be correlated, so each sample is weighted by the time that it represents. The unweighted sum must
-also reach h = `LEAST_RATIO`, which a healthy motor's sum does with a probability of at most exp(-h) after any given
-check.
+also reach h = `LEAST_RATIO`. From any given check on, a healthy motor's sum does so with a probability of at most
+exp(-h).
 
-While a joint stands still, its readings may also freeze at the commanded current, and the goal may take seconds to get
-far from it. But a motor's current follows its goal: if the readings of position, velocity and current all stay exactly
-the same although the goals that they may reflect (those of the last `ANSWERS_S`) have changed, they are frozen. A
-constant sensor error cancels in this comparison.
+While a joint stands still, its readings may also freeze at the commanded current, from which the goal may take seconds
+to move far away. But a motor's current follows its goal: if the readings of position, velocity and current all stay
+exactly the same although the goals that they may reflect (those of the last `ANSWERS_S`) have changed, they are frozen.
+A constant sensor error cancels in this comparison.
 
 A current sensor may be noisier than assumed. Its noise is measured at constant goals, while the arm rests before the
-start (`current_noise`), and is a lower bound of sigma: a noisy reading then means that lost torque is found later, not
+start (`current_noise`), and is a lower bound on sigma: a noisy reading then means that lost torque is found later, not
 that a healthy motor is stopped.
 
-The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). The state that it keeps for
-a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). Its state for a joint is a
+record of type `MEMORY`.
 """
 
 from typing import Any
@@ -46,16 +46,16 @@ SIGMA_SHARE = 0.05
 """Standard deviation of other errors, relative to the planned peak."""
 
 SIGMA_TICKS = 2.0
-"""Lower bound of the standard deviation of current errors, in register ticks."""
+"""Lower bound on the standard deviation of current errors, in register ticks."""
 
 ALLOWED_TICKS = 4.0
-"""Lower bound of the accepted deviation, in register ticks."""
+"""Lower bound on the accepted deviation, in register ticks."""
 
 LOST_AFTER_S = 0.03
 """Time for which a current must look like zero, at full weight, before it counts as zero [s]."""
 
 _FULL_WEIGHT = 5.0
-"""Upper bound on the log likelihood ratio of one sample: that of a goal of four sigma if zero is measured."""
+"""Upper bound on the log likelihood ratio of one sample: its value if zero is measured at a goal of four sigma."""
 
 LEAST_RATIO = 10.0
 """Log likelihood ratio at which a current counts as zero, however low the rate."""
@@ -85,8 +85,8 @@ GOALS = np.dtype(
 
 most: largest change of the goal under which all readings may stay the same [A or V]. carried, same_for: current, and
 how long all readings have been the same [s]. age: age of the latest block [s]. low, high: smallest and largest goal in
-each block, the latest first. lowest, highest: the smallest upper and the largest lower end of the range of goals that
-one of these readings may reflect.
+each block, the latest first. lowest, highest: smallest upper end and largest lower end of the ranges of goals
+that the readings since then may reflect.
 """
 
 MEMORY = np.dtype(

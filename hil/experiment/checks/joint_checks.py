@@ -1,9 +1,9 @@
 """Checks of every joint in every exchange, in one compiled loop because there is little time between samples.
 
-They are, in this order: a jump of the position, the limits of position and velocity, whether the motor carries the
+They check, in this order: jumps of the position, the limits of position and velocity, whether the motor carries the
 commanded current (`following`), whether position and velocity agree (`consistency`), whether the motor turns as
 commanded (`work`), and whether all readings are frozen although the goal changes (`following` again). Everything known
-about a joint is in one record of the type `JOINT`.
+about a joint is in one record of type `JOINT`.
 """
 
 from collections.abc import Callable
@@ -59,7 +59,7 @@ from the goal [s], or work taken out of the arm [J].
 
 
 class JointChecks:
-    """The records of the joints, an array of the type `JOINT`, and their latest sample.
+    """The records of the joints, an array of type `JOINT`, and their latest sample.
 
     interval: time between two exchanges [s].
     """

@@ -21,13 +21,13 @@ limit.
 """
 
 _LACKS_S, _EXPLAINED = 0.1, 0.5
-"""The supply explains missing torque if it caused at least `_EXPLAINED` of it within the last `_LACKS_S` [s]."""
+"""The supply explains missing torque if it accounts for at least `_EXPLAINED` of it within the last `_LACKS_S` [s]."""
 
 _FEWEST = 4
 """Minimum number of readings from which to explain how a current differs from its goal."""
 
 Fault = tuple[Cause, str]
-"""The cause and a sentence without its subject, the joint."""
+"""The cause, and a sentence whose subject, the joint, is left out."""
 
 
 class JointFaults:
@@ -218,7 +218,7 @@ def _is_stuck(readings: Sequence[tuple[float, float]], least: float) -> bool:
 
 
 def _is_shifted(readings: Sequence[tuple[float, float]], least: float) -> bool:
-    """Whether a current follows its goal, which has changed by more than `least`, but with an offset."""
+    """Whether a current follows its goal with an offset; offset and goal change must both exceed `least`."""
     if len(readings) < _FEWEST:
         return False
     goals = [goal for goal, _ in readings]

@@ -3,8 +3,8 @@
 Work is checked only without a stabiliser. Without one, the arm starts at a stable rest pose and cannot return more work
 than was put in. A motor that keeps taking work out of it therefore turns the wrong way.
 
-The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). The state that it keeps for
-a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). Its state for a joint is a
+record of type `MEMORY`.
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ TOLERANCE_RAD = 0.04
 """A motor is considered reversed if the work that it has taken out of the arm, divided by the joint's largest planned
 torque, exceeds this [rad].
 
-Delays cause a healthy motor to take out up to 0.02 rad, for a heavy arm at 20 Hz.
+Because of delays, this is up to 0.02 rad for a healthy motor, with a heavy arm at 20 Hz.
 """
 
 _OF_OTHERS = 0.5
@@ -28,8 +28,8 @@ _OF_OTHERS = 0.5
 MEMORY = np.dtype([("scale", "f8"), ("least", "f8"), ("done", "f8"), ("held", "f8")])
 """Constants and state of the check of one joint.
 
-scale: torque per goal [N m/A or N m/V]. least: work below which the sign is uncertain [J]. done: work done so far [J].
-held: latest goal [A or V].
+scale: torque per goal [N m/A or N m/V]. least: lowest work that does not indicate a reversal [J]. done: work done so
+far [J]. held: latest goal [A or V].
 """
 
 

@@ -1,9 +1,9 @@
-"""Stop of an arm that cannot hang freely: brake, then lower it to its rest pose while its servos accept commands.
+"""Stops an arm that cannot hang freely: brakes it, then lowers it to its rest pose while its servos accept commands.
 
 The feed-forward torque is combined with the stabiliser's spring and damper, which track the path to the rest pose;
-while a joint is off the path, an additional torque towards it grows. Lowering is monitored like the experiment; torque
-is also cut if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities that agree
-with the positions.
+while a joint is off the path, an additional torque towards the path grows. Lowering is monitored like the experiment;
+torque is also cut if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities that
+agree with the positions.
 
 Replies may be missing for a moment, even at the beginning: joints that are not heard get only the feed-forward torque.
 """
@@ -260,7 +260,7 @@ class Lowering:
         )
 
     def others_answer(self) -> None:
-        """Record that some servos that are not heard do answer: a silent one hides their replies."""
+        """Record that some unheard servos do answer, but a silent one hides their replies."""
         self._guard.others_answer()
 
     def late(self, seconds: float) -> None:

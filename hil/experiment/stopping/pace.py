@@ -1,4 +1,4 @@
-"""Choose how often to command an arm that is being lowered, and how long to wait for replies, adapting to late ones.
+"""Choose how often to command an arm that is being lowered, and how long to wait for replies, which may be late.
 
 Servos hold their latest goal. If replies come too late for one exchange per sample, only every second or third sample
 is exchanged from then on, until the end.

@@ -1,10 +1,10 @@
 """Bounds on the bias of a servo's velocity reading, inferred from its positions.
 
 With a bias, as from a register rounded downwards, the position departs from the integral of the velocity in proportion
-to the time in motion, as it does if it creeps. But a servo's bias is constant: initially it may be plus or minus half a
-step, and every sample of a run narrows this range, since position and integral cannot be farther apart than bias times
-time plus known errors. Creep that begins later leaves the range and cannot widen it. If twice these errors do not
-explain the distance, the position creeps.
+to the time in motion, just as a creeping position does. But a servo's bias is constant: initially it may be plus or
+minus half a step, and every sample of a run narrows this range, since position and integral cannot be farther apart
+than bias times time plus known errors. Creep that begins later leaves the range and cannot widen it. If twice these
+errors do not explain the distance, the position creeps.
 """
 
 from typing import Any
@@ -35,7 +35,7 @@ def begin(bias: Any) -> None:
 def look(bias: Any, apart: float, errors: float, moving: float) -> bool:
     """Process the difference after `moving` seconds of motion [rad, s]; return whether the position creeps.
 
-    If no bias in the current range explains it, the range shrinks to the nearest value.
+    If no bias in the current range explains the difference, the range shrinks to the nearest value.
     """
     if abs(unexplained(bias, apart, moving)) > CERTAINLY * errors:
         return True

@@ -19,7 +19,7 @@ BLOCK_S, BLOCKS = 0.1, 4
 """Duration of a block [s], and the number of blocks that are compared with all earlier ones."""
 
 CHANGED_S, CHANGED_SHARE = 0.005, 0.35
-"""Accepted change of the lag: an absolute part [s], and a fraction of the former lag."""
+"""Accepted change of the lag: an absolute part [s], and a fraction of the earlier lag."""
 
 TIMES = 4.0
 NOISE_RAD, LASTS_S = 0.0015, 0.1
@@ -29,8 +29,7 @@ LEAST_INFORMATION = 0.1
 """Smallest integral of the squared change of velocity, excluding what a scale error explains [rad^2/s]."""
 
 ENOUGH_INFORMATION, ALL_INFORMATION = 0.3, 3.0
-"""Integrals as in `LEAST_INFORMATION`, over the whole run, at which lag and scale error become known, and are frozen.
-"""
+"""Integrals as in `LEAST_INFORMATION`, over the whole run, above which lag and scale error are known, and frozen."""
 
 SEPARATE = 0.05
 """Fraction of the squared change of velocity that a scale error must leave unexplained to be distinct from a lag."""

@@ -1,5 +1,5 @@
 """Section on friction versus speed: the model's curve with its interval, and the torque that remains after inertia and
-gravity are subtracted, for the measured and for the model's motion.
+gravity are subtracted, for the measured and the simulated motion.
 """
 
 import numpy as np

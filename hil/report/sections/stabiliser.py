@@ -1,4 +1,4 @@
-"""Section on the stabiliser's share of the commanded torque."""
+"""Section on the stabiliser's contribution to the commanded torque."""
 
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table

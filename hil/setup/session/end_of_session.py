@@ -52,7 +52,7 @@ def _retract(stopped: BaseException, told: str) -> None:
 def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
     """Return the exception to raise in place of `error` if torque is now off on all servos, otherwise None.
 
-    It is the exception that led to torque being cut. If replies were missing only when torque was cut at the end, it is
+    This is the exception that led to torque being cut or, if replies were missing only when torque was cut at the end,
     an ExperimentError. A note about the torque state is attached to it.
     """
     report = bus.torque_off_report

@@ -40,7 +40,7 @@ class SavedSettings:
     reduced: dict[Joint, dict[str, int]] = field(default_factory=dict)
     """Goals restored only as far as a lowered limit allows, with the restored values."""
     undone: dict[tuple[Joint, str], tuple[int, int]] = field(default_factory=dict)
-    """Registers that held another program's value: that value, and the restored one."""
+    """Registers that held another program's value, with that value and the restored one."""
     _refused: set[Joint] = field(default_factory=set)
     """Servos whose Current Limit another program has left too low for this run; the file keeps its former value."""
 
