@@ -39,10 +39,12 @@ __all__ = [
 class DriverError(Exception):
     """Base class of all errors raised by the servo drivers.
 
-    last_samples: the last samples that an experiment recorded before the error, if one was running.
+    last_samples: the last samples that an experiment recorded before the error, if one was running. in_doubt: the
+    registers that may differ from what was to be restored, if all others are known to be restored.
     """
 
     last_samples: object = None
+    in_doubt: tuple[str, ...] = ()
 
 
 class UnknownModel(DriverError):

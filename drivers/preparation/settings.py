@@ -110,16 +110,12 @@ def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
     return cut
 
 
-AS_BEFORE = "all other settings are as before."
-"""End of the message of an error after which only some registers are in doubt."""
-
-
 def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, int]]:
     """Restore the registers that differ from `settings`; return their old and new values by name.
 
     Goals are restored as far as the servo's limits allow (`attainable`). Each register is read back. Raises
     WrongSetting if torque is on. Raises the errors of `Servo.write` only after all other registers have been tried; the
-    message then names the registers in doubt.
+    error then has the registers `in_doubt`, and its message names them.
     """
     if servo.read_despite_error("Torque Enable"):
         raise WrongSetting(f"{servo.title}: its settings cannot be restored while its torque is on.")
@@ -141,7 +137,8 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
     if failures:
         failed = next(iter(failures.values()))
         if len(failures) < len(RAM):  # otherwise the servo is hardly there
-            failed.args = (f"{failed} Only {', '.join(failures)} may differ; {AS_BEFORE}",)
+            failed.in_doubt = tuple(failures)
+            failed.args = (f"{failed} Only {', '.join(failures)} may differ; all other settings are as before.",)
         raise failed
     return written
 

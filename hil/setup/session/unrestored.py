@@ -6,7 +6,6 @@ from pathlib import Path
 
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import AS_BEFORE
 from hil.drivers.torque.off import and_list, by_reason
 from hil.setup.changed_settings import Settings
 from hil.setup.session.killed_run import recover
@@ -37,15 +36,15 @@ def unrestored(
         *_lowered_limits(saved, before, failed),
         *_changed_meaning(saved, before, failed),
         *(
-            f"{_outcome(and_list(map(str, joints)), why)} {why} {_NEXT} "
-            f"{_where([saved.kept[joint].path for joint in joints])}."
+            f"{_outcome(joints, failed)} {why} {_NEXT} {_where([saved.kept[joint].path for joint in joints])}."
             for why, joints in by_reason((joint, str(error)) for joint, error in failed.items()).items()
         ),
     ]
 
 
-def _outcome(servos: str, why: str) -> str:
-    if AS_BEFORE in why:
+def _outcome(joints: Sequence[Joint], failed: Mapping[Joint, DriverError]) -> str:
+    servos = and_list(map(str, joints))
+    if all(failed[joint].in_doubt for joint in joints):
         return f"Not all settings of {servos} are known to be restored."
     return f"The settings of {servos} could not be restored."
 
