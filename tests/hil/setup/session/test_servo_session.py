@@ -13,7 +13,7 @@ import pytest
 
 from hil.cli.errors import message
 from hil.config.schema import load_config
-from hil.drivers.errors import BusShared, DriverError, PortLost, TorqueNotOff, WrongModel
+from hil.drivers.errors import BusShared, DriverError, PortLost, ServoRefused, TorqueNotOff, WrongModel
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.prepare import prepare_servo
 from hil.drivers.servo import Servo
@@ -388,6 +388,22 @@ def test_settings_are_not_restored_to_a_servo_of_another_model(arm: Arm, bench: 
         bench.servos[2].memory.set("Model Number", 1060)
         bench.eeprom[2].clear()
     assert bench.eeprom[2] == []
+
+
+def test_where_one_register_cannot_be_restored_the_message_names_it_and_no_other(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = Servo.write_despite_error
+
+    def refused(servo: Servo, name: str, value: int) -> None:
+        if (servo.id, name) == (2, "Operating Mode"):
+            raise ServoRefused("It refuses to set its Operating Mode.")
+        write(servo, name, value)
+
+    said = r"Not all settings of joint 'elbow' \(ID 2.*\) are known to be restored\. .*Only Operating Mode may differ"
+    with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
+        monkeypatch.setattr(Servo, "write_despite_error", refused)
+    assert [each.split(" of ")[0] for each in bench.changed()] == ["Operating Mode"]
 
 
 def test_two_servos_of_different_models_that_swapped_their_ids_are_named() -> None:
