@@ -46,7 +46,7 @@ def unrestored(
 
 def _outcome(servos: str, why: str) -> str:
     if AS_BEFORE in why:
-        return f"Not all settings of {servos} are known to be restored."
+        return f"Some settings of {servos} may not have been restored."
     return f"The settings of {servos} could not be restored."
 
 

@@ -135,7 +135,7 @@ def test_packets_of_another_master_while_settings_are_restored_are_named(
 
     end = ServoSession.end
     monkeypatch.setattr(ServoSession, "end", begins)
-    with pytest.raises(ExperimentError, match="Another program has sent packets on this bus"):
+    with pytest.raises(ExperimentError, match="Another program sent packets on this bus"):
         if is_run:
             play(arm(SHORT), tmp_path / "run")
         else:
