@@ -312,7 +312,7 @@ class ServoBus(TorqueSwitch):
         self._last_answers = reply.servos
         state = self._converter.state(ticks, reply)
         if (strangers := exchange.heard.strangers) > MOST_STRANGERS:
-            raise overheard(f"has sent {strangers} packets, or requested them from servos,")
+            raise overheard(f"has sent or requested {strangers} packets")
         if exchange.heard.mixed_up > MOST_MIXED_UP:
             raise WrongReply(exchange.heard.mixed_up_advice(self.port.url))
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state

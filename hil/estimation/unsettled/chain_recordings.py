@@ -213,7 +213,7 @@ def _verdict(
     if found.simulated:
         worst = float(found.residual_over_noise.max())
         joint = arm.joints[int(np.argmax(found.residual_over_noise))].name
-        sentences.append(f"The largest residual, {joint}'s, is {worst:.2f} times the noise of its angle.")
+        sentences.append(f"The largest residual ({joint}) is {worst:.2f} times the noise of its angle.")
         trust = trust if worst <= EXPLAINED else "with care"
         if found.systematic > SYSTEMATIC:
             trust = "with care"
