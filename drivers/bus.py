@@ -173,7 +173,7 @@ class ServoBus(TorqueSwitch):
         if self.config.watchdog_required:
             raise WrongModel(
                 f"{joint.title}: firmware {firmware} has no Bus Watchdog; {joint.servo.watchdog_firmware} or newer is "
-                "needed. Update it with DYNAMIXEL Wizard 2.0. With safety.allow_no_watchdog = true the servo is "
+                "needed. Update it with DYNAMIXEL Wizard 2.0. With safety.allow_no_watchdog = true, the servo is "
                 "accepted, but nothing then stops it when the program is killed or the cable is pulled."
             )
         self._without_watchdog.add(joint)
