@@ -172,7 +172,7 @@ class ServoBus(TorqueSwitch):
         if self.config.watchdog_required:
             raise WrongModel(
                 f"{joint.title}: firmware {firmware} has no Bus Watchdog; {joint.servo.watchdog_firmware} or newer is "
-                "needed. Update it with DYNAMIXEL Wizard 2.0. With safety.allow_no_watchdog = true the servo is "
+                "needed. Update it with DYNAMIXEL Wizard 2.0. With safety.allow_no_watchdog = true, the servo is "
                 "accepted, but nothing then stops it when the program is killed or the cable is pulled."
             )
         self._without_watchdog.add(joint)
@@ -311,7 +311,7 @@ class ServoBus(TorqueSwitch):
         self._last_answers = reply.servos
         state = self._converter.state(ticks, reply)
         if (strangers := exchange.heard.strangers) > MOST_STRANGERS:
-            raise overheard(f"has sent {strangers} packets, or requested them from servos,")
+            raise overheard(f"has sent or requested {strangers} packets")
         if exchange.heard.mixed_up > MOST_MIXED_UP:
             raise WrongReply(exchange.heard.mixed_up_advice(self.port.url))
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state

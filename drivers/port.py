@@ -94,7 +94,7 @@ def _claim(url: str, opened: serial.Serial) -> None:
     keep_others_out(opened.fileno())
     if users := other_users(url):
         raise PortNotOpened(
-            f"Cannot open port {url!r}: {' and '.join(users)} has it open too and would steal replies or send its own "
+            f"Cannot open port {url!r}: it is already open in {' and '.join(users)}, which would steal replies or send "
             "goals. Close that program first."
         )
 
@@ -477,8 +477,8 @@ def _advice(error: BaseException, url: str) -> str:
         )
     if "No such file" in text and "://" in url:
         return (
-            "The file in this URL does not exist. A relative path in a configuration starts at that file's folder, any "
-            "other at the working directory."
+            "The file in this URL does not exist. A relative path starts at the configuration's folder or, outside a "
+            "configuration, at the working directory."
         )
     if "No such file" in text:
         return "Is the adapter plugged in? `hil scan` lists the ports that exist."

@@ -192,7 +192,7 @@ class Servo:
             self.port.discard_input()
         if result == COMM_RX_TIMEOUT and len(others) == 1 and (other := others.pop()) not in (-1, self.id):
             raise NoReply(
-                f"Requests to {self.title} are answered with ID {other} ({what}): the servos' IDs or replies "
+                f"Requests to {self.title} are answered by ID {other} ({what}): the servos' IDs or replies "
                 "are mixed up. Check that every servo has its own ID, and whether a device on the bus changes replies."
             )
         if result == COMM_RX_TIMEOUT:

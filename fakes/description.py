@@ -55,7 +55,9 @@ class FakeServo(Described):
     current_noise_a: Annotated[float, Field(ge=0, le=10, description="standard deviation of Present Current [A]")] = 0.0
     senses_supply: Annotated[
         bool | None,
-        Field(description="whether Present Current is the supply current, not the motor's; default: by model"),
+        Field(
+            description="whether Present Current is the supply current, not the motor's; default depends on the model"
+        ),
     ] = None
     encoder: Annotated[Encoder, Field(description="errors of Present Position; none by default")] = PERFECT
     clock_error_ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="clock error; positive: fast [ppm]")] = 0.0
@@ -121,10 +123,10 @@ class FakeArm(Described):
         Field(strict=False, min_length=1, description="servos on the bus, in the order of the joints"),
     ]
     arm: Annotated[Arm | None, Field(description="links and drives of a planar arm")] = None
-    chain: Annotated[ChainArm | None, Field(description="a spatial arm described by a URDF, instead of arm")] = None
+    chain: Annotated[ChainArm | None, Field(description="a spatial arm described by a URDF, instead of `arm`")] = None
     plant: Annotated[
         str | None,
-        Field(description='"module:factory" of a custom mechanism, instead of arm; see hil.fakes.plants.plant'),
+        Field(description='"module:factory" of a custom mechanism, instead of `arm`; see hil.fakes.plants.plant'),
     ] = None
     plant_options: Annotated[dict[str, Any], Field(description="arguments of the factory")] = {}  # noqa: RUF012
     supply: Annotated[Supply | None, Field(description="resistance of the supply; none by default")] = None

@@ -113,17 +113,17 @@ class Heard:
             return ""
         if strange := [each for each in self.senders if each not in self._ids]:
             return (
-                f"Intact replies came with ID {', '.join(map(str, dict.fromkeys(strange)))}, which was not addressed: "
+                f"Intact replies came from ID {', '.join(map(str, dict.fromkeys(strange)))}, which was not addressed: "
                 f"a servo's ID has changed, or the reply is another servo's. `hil scan {url}` lists the IDs."
             )
         if self.mixed_up or len(set(self.senders)) < len(self.senders):
             return self.mixed_up_advice(url)
-        return "Bytes arrived, but damaged or incomplete: check the cables and what else may be sending on the bus."
+        return "Bytes arrived, but damaged or incomplete: check the cables, and whether anything else sends on the bus."
 
     def mixed_up_advice(self, url: str) -> str:
         """Return advice for the user about replies whose IDs do not match the request."""
         return (
-            f"Intact replies came with the IDs {', '.join(map(str, self.senders))}, although each servo was "
+            f"Intact replies came from IDs {', '.join(map(str, self.senders))}, although each servo was "
             "asked once: replies are repeated or mixed up, or two servos have the same ID. "
             f"`hil scan {url}` lists the IDs."
         )

@@ -231,6 +231,6 @@ def _check_motion(recording: Recording) -> None:
             )
         if speed[k] > MOST_SPEED:
             raise RecordingError(
-                f"joint {joint + 1} jumps by {step[k]:.3g} rad, {speed[k]:.3g} rad/s, after sample {k + 1} at "
+                f"joint {joint + 1} jumps by {step[k]:.3g} rad ({speed[k]:.3g} rad/s) after sample {k + 1} at "
                 f"{recording.time[k]:g} s: unwrap the angle, or check its unit"
             )

@@ -190,7 +190,7 @@ def _check_motion(period: SettledPeriod) -> None:
         least = LEAST_MOTION * float(period.position_step[joint])
         if swing <= least:
             raise StandstillError(
-                f"joint {joint + 1} moved by {swing:.2g} rad, held by friction; at least {least:.2g} rad are needed: "
+                f"joint {joint + 1}, held by friction, moved by {swing:.2g} rad; at least {least:.2g} rad are needed: "
                 "raise its peak torque"
             )
     filled = period.filled()

@@ -149,7 +149,7 @@ def conflict_sentences(found: Sequence[Conflict], explained: bool) -> tuple[str,
         return tuple(each.said for each in found)
     return (
         *(each.said for each in found),
-        "Since the model does not explain the motion either, an effect missing from it probably distorts these values "
-        "and the others as well. Eliminate that effect (gear backlash, a loose screw or horn, a dragging cable, a weak "
-        "supply) and identify again.",
+        "The model does not explain the motion either: an effect that it lacks probably distorts these and all other "
+        "values. Eliminate that effect (gear backlash, a loose screw or horn, a dragging cable, a weak supply) and "
+        "identify again.",
     )

@@ -61,7 +61,7 @@ OPTIONS: dict[Option, str] = {
     "asymmetry": "direction-dependent viscous friction",
     "ripple": "torque ripple over the joint angle",
     "cogging": "cogging: torque that varies over the joint angle, whether or not the motor is driven",
-    "zeros": "joint zero offsets; the first joint's is observable only under gravity",
+    "zeros": "joint zero offsets; the first one is observable only under gravity",
     "torque_scale": "ratio of the joints' torque constants; one of them must be trusted",
     "saturation": "torque saturation: torque falls short of large commands",
     "cable": "a cable or spring that pulls the joint towards one angle",
@@ -278,7 +278,7 @@ _DECLARED = (
     Term(
         "lag_difference",
         "s",
-        "lag of the joint's torque relative to joint 1's; without lags, of its delay",
+        "additional lag of the joint's torque relative to joint 1's; without lag, additional delay",
         part="lags",
         first_joint=2,
         range="any",
@@ -289,7 +289,7 @@ _DECLARED = (
     Term(
         "back_emf",
         "1",
-        "share of viscous friction due to back-EMF, which is subject to the drive's lag like the voltage",
+        "fraction of viscous friction that is due to back-EMF and subject to the drive's lag",
         part="voltage",
         initial=0.92,
         log_spread=0.08,

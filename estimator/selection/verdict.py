@@ -170,7 +170,7 @@ def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
             f"The residual looks most like {what}, which would explain {100.0 * seen[0].explained:.0f} % of it.{advice}"
         )
     if not evidence.tried_all and estimate.model.friction != "stribeck_load":
-        return 'No single term explains the residual; [model] friction = "auto" tries them together.'
+        return 'No single term explains the residual; [model] friction = "auto" tries several together.'
     return (
         "No available term explains the residual. Possible causes: cogging or torque ripple, backlash, a loose screw, "
         "a sagging supply or a dragging cable."
@@ -188,7 +188,7 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
     if not worst and trust == "no":
         return "This error may bias all parameters, regardless of their standard errors."
     if not worst:
-        return "This error does not affect the parameters significantly: including it, each is known to 2 % or better."
+        return "This error does not affect the parameters significantly: even with it, each is known to 2 % or better."
     named = sorted(worst, key=lambda name: -worst[name])
     known = {name: percent(part) if np.isfinite(part) else "not determined" for name, part in worst.items()}
     listed = ", ".join(f"{name} ({known[name]})" for name in named[:4])
@@ -252,8 +252,8 @@ def _pushed(torque: TorqueChange | None) -> tuple[str, ...]:
     )
     return (
         f"Relative to the fitted motion, a constant torque of {found} acts in the held-out one. It explains the "
-        "difference better than a change of friction. In one of the two motions, something pushed or pulled the arm, a "
-        "cable tightened, the arm carried something, or its base tilted. Remove the cause and record again.",
+        "difference better than a change of friction does. In one of the two motions, something pushed or pulled the "
+        "arm, a cable tightened, the arm carried something, or its base tilted. Remove the cause and record again.",
     )
 
 

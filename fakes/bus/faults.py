@@ -77,7 +77,8 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
         "an instruction packet arrives with a wrong CRC at one servo, or at all servos"
     ),
     FaultKind.STATUS_ERROR: FaultFacts(
-        "a servo refuses commands and answers with an error; with 128 (only the Alert bit) it obeys and sets Alert",
+        "a servo refuses commands and answers with an error; if amount=128 (only the Alert bit), it obeys and sets "
+        "Alert",
         "ERR byte",
         1,
     ),

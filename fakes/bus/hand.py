@@ -48,7 +48,7 @@ class Move(Described):
     @model_validator(mode="after")
     def _one_end(self) -> Self:
         if (self.to is None) == (self.ticks is None):
-            raise ValueError("give either to (an angle, rad) or ticks (a Present Position)")
+            raise ValueError("give either `to` (angle, rad) or `ticks` (Present Position)")
         return self
 
 

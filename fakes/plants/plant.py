@@ -110,7 +110,8 @@ def load_plant(name: str, options: Mapping[str, object]) -> Plant:
     """
     if name not in OWN_PLANTS and not _leave["code"]:
         raise PlantError(
-            f'plant = "{name}" is code that this file wants to run, with {dict(options)}: nothing was run. Inspect it; '
+            f'plant = "{name}" is code that this file wants to run, with {dict(options)}: nothing was run. Inspect '
+            "this code; "
             "if you trust the file, use --allow-code, or hil.fakes.allow_code() in Python. Otherwise, only "
             f"{' and '.join(sorted(OWN_PLANTS))} are allowed"
         )
@@ -130,7 +131,8 @@ def load_plant(name: str, options: Mapping[str, object]) -> Plant:
     ]
     if missing:
         raise PlantError(
-            f'plant = "{name}": its {type(plant).__name__} lacks {", ".join(missing)} of hil.fakes.plants.plant.Plant'
+            f'plant = "{name}": its {type(plant).__name__} lacks {", ".join(missing)}, required by '
+            "hil.fakes.plants.plant.Plant"
         )
     checked = CheckedPlant(plant, name)
     checked.check()

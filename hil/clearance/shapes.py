@@ -86,8 +86,12 @@ def shapes_of(arm: ArmDescription) -> Shapes:
 def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule], is_last: bool) -> str:
     why = "; ".join(unread) if unread else "it has no collision or visual geometry"
     if not instead:
-        left = "Only its other shapes are checked" if has_others else "It has no shape"
-        return f'link "{name}": {why}. {left}: the clearance to it is unknown.'
+        left = (
+            "Only its other shapes are checked: the clearance to the rest"
+            if has_others
+            else "It has no shape: the clearance to it"
+        )
+        return f'link "{name}": {why}. {left} is unknown.'
     (capsule,) = instead
     length = float(np.linalg.norm(capsule.ends[1]))
     along = f"capsule {1e3 * length:.0f} mm long from its joint to {'its end' if is_last else 'the next one'}"

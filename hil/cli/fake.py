@@ -35,7 +35,7 @@ def describe_fake(config: Path, faults: list[str], moves: list[str], seed: int |
         )
     for move in fake.moves:
         end = f"{move.to:g} rad" if move.to is not None else f"{move.ticks} ticks"
-        say(console, f"hand: servo {move.servo} to {end} at {move.at:g} s within {move.duration:g} s")
+        say(console, f"hand: servo {move.servo} to {end} at {move.at:g} s, taking {move.duration:g} s")
     print(f"\nTo let any program use this arm: {command('fake', config, '--pty')}")
     say(console, f'In Python with pyserial: hil.fakes.register(), then serial_for_url("fake://{config}")')
 

@@ -218,7 +218,7 @@ def _path_slips(config: "Config") -> Iterator[str]:
         if speed > joint.velocity_limit:
             hint = in_other_units(speed, "rad/s", lambda limited: limited <= least)
             yield (
-                f"joint_path.speed: {speed:g} rad/s for {joint.name!r}, above its velocity_limit of "
+                f"joint_path.speed: {speed:g} rad/s for {joint.name!r} is above its velocity_limit of "
                 f"{joint.velocity_limit:g} rad/s" + (f". {hint}" if hint else "")
             )
 

@@ -153,7 +153,7 @@ class SafetyConfig(Table):
         0.6, le=5, description="rad/s, speed at which a stop lowers a spatial arm to its rest pose"
     )
     lower_time: PositiveFloat = Field(
-        10.0, le=60, description="s, maximum duration of lowering; if the path is long, lower_speed is exceeded"
+        10.0, le=60, description="s, maximum duration of lowering, for which lower_speed is exceeded if necessary"
     )
     limit_chance: float = Field(
         0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"
@@ -197,7 +197,9 @@ class Config(Table):
     stabiliser: StabiliserConfig | None = None
     clearance: ClearanceConfig = ClearanceConfig()
     known: KnownConfig | None = None
-    columns: Columns | None = Field(None, description="of recordings made with other tools; see hil.config.csv_columns")
+    columns: Columns | None = Field(
+        None, description="columns of recordings made with other tools; see hil.config.csv_columns"
+    )
     fake: FakeArm | None = None
 
     @model_validator(mode="before")
@@ -401,7 +403,7 @@ def _check_rest_pose(joint: JointConfig, rest: float) -> None:
     low, high = joint.position_limit
     if not low < rest < high:
         where = "at the end of" if rest in (low, high) else "outside"
-        room = "; leave some room there" if rest in (low, high) else ""
+        room = "; leave a margin" if rest in (low, high) else ""
         raise ValueError(
             f"arm.rest_pose: {rest:g} rad for joint {joint.name!r} is {where} its position_limit "
             f"[{low:g}, {high:g}]{room}"

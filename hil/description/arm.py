@@ -74,7 +74,7 @@ MOST_LINKS = 500
 def check_size(links: int, path: Path) -> None:
     """Raise ArmFileError if a description has more than `MOST_LINKS` links."""
     if links > MOST_LINKS:
-        raise ArmFileError(f"{path} has {links} links; at most {MOST_LINKS} are read")
+        raise ArmFileError(f"{path} has {links} links; at most {MOST_LINKS} are allowed")
 
 
 @dataclass(frozen=True)

@@ -298,7 +298,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
         if noise > NOISY * QUANTISATION_FLOOR_TICKS
         else "its noise, which is only encoder rounding"
     )
-    said = f"The largest residual, {config.joints[joint].name}'s, is {over:.2f} times {measured};"
+    said = f"The largest residual ({config.joints[joint].name}) is {over:.2f} times {measured};"
     if is_explained(estimate):
         return f"{said} nothing remains unexplained."
     causes = "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time"

@@ -82,7 +82,7 @@ class Deadlines:
             heard = (
                 self._heard_instead() or "Check the cables, the supply and whether anything else is sending on the bus."
             )
-            return f", most of them while waiting for replies that were lost or damaged. {heard}"
+            return f", most of them while this program waited for replies that were lost or damaged. {heard}"
         return (
             f": the replies arrive too late for {1 / self._interval:g} Hz. `hil check` measures what this bus can do: "
             "check the adapter's latency timer and the servos' return delay, or lower experiment.rate."

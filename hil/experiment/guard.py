@@ -290,9 +290,9 @@ class Guard:
     def _still_swings(self) -> str:
         """Return advice for an arm that has not come to rest."""
         if not self._left_by_a_run:
-            return "If it is still swinging, as an arm with little friction does, wait until it is at rest."
+            return "If it is still swinging, as an arm with little friction may be, wait until it is at rest."
         longer = f"raise safety.rest_time ({self._safety.rest_time:g} s)"
-        return f"If it is still swinging after the previous run, as an arm with little friction does, {longer}."
+        return f"If it is still swinging after the previous run, as an arm with little friction may be, {longer}."
 
     def look_at_supply(self, index: int, lacking: float, recent: Sequence[State]) -> None:
         """Raise SafetyStop if the measured current shows that the supply explains a joint's missing torque [N m]."""

@@ -359,7 +359,7 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
     if has_moved():
         _check_inside(config, bus)
     tolerance = tolerance_now(config)
-    or_there = " If that is where the arm lies without torque, set arm.rest_pose to it." if config.is_chain else ""
+    or_there = " If the arm lies there without torque, set arm.rest_pose to this pose." if config.is_chain else ""
     for joint, position, rest in zip(bus.joints, _positions(config, bus), config.arm.rest_pose, strict=True):
         if abs(position - rest) > tolerance:
             ticks = joint.zero_ticks + round((position - rest) / joint.position_unit)

@@ -131,7 +131,7 @@ class StatusCheck:
         if ticks == WATCHDOG_TRIPPED:
             return Cause.WATCHDOG, (
                 "has lost its torque: its watchdog tripped (Bus Watchdog reads 255). It received nothing for "
-                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms, {self._why_tripped()}."
+                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms{self._why_tripped()}."
             )
         if self._may_be_unwatched:
             return None
@@ -144,8 +144,8 @@ class StatusCheck:
     def _why_tripped(self) -> str:
         """Return why a watchdog may have tripped, given how regularly this program has sent packets."""
         if self.longest_gap > 0.5 * self._armed * WATCHDOG_UNIT:
-            return "unless the computer kept this program waiting: check its plug and cable"
-        return "or another program has set this register: check its plug and cable, and end other programs"
+            return ": check its plug and cable, unless the computer kept this program waiting"
+        return ", or another program has set this register: check its plug and cable, and end other programs"
 
     def _goal(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
         if abs(status.goal - sent) < self._half_tick[joint]:

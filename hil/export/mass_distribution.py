@@ -108,4 +108,4 @@ def _positive(name: str, value: float) -> None:
 
 def _reject_length(link_length: float | None, why: str) -> None:
     if link_length is not None:
-        raise ExportError(f"--link-length = {link_length:g} m is not needed here: {why}. Remove it.")
+        raise ExportError(f"--link-length = {link_length:g} m is not needed here: {why}. Omit the option.")

@@ -48,7 +48,7 @@ class Table:
             dates = " Dates and times are read in the form 2026-03-01T12:00:00.008 (ISO 8601)."
             raise CsvError(
                 f"{self.source}, {self.row_word} {bad[0] + self.first_row}: column {full!r} is {text!r}; it must be a "
-                f"finite number{', not so large' if re.fullmatch('[-+.0-9]+e[+]?[0-9]+', text.lower()) else ''}."
+                f"finite number{'; this is too large' if re.fullmatch('[-+.0-9]+e[+]?[0-9]+', text.lower()) else ''}."
                 f"{dates if re.search('[0-9][-:/.][0-9]', text) else ''}"
             )
         return full, values, self.units.get(full) or split_head(full)[1]

@@ -331,7 +331,7 @@ class StabiliserShare:
                 names, self.rms, self.commanded_rms, self.share, self.peak, strict=True
             )
         )
-        return f"Share of torque from the stabiliser: {each}."
+        return f"Torque from the stabiliser: {each}."
 
 
 @dataclass(frozen=True)

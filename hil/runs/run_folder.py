@@ -163,8 +163,8 @@ class RunFolder:
             )
         if (path / "recordings.npz").is_file():
             raise RunFolderError(
-                f"{path} is an estimate from another tool's recordings, without a run of hil identify or hil record, "
-                "which is needed here. hil.load_model and hil export read the arm from it."
+                f"{path} is an estimate from another tool's recordings, but a run of hil identify or hil record "
+                "is needed here. hil.load_model and hil export read the arm from it."
             )
         if steps := steps_of(path):
             raise RunFolderError(only_steps(path, steps))

@@ -113,10 +113,10 @@ def seldom_read_back(bus: ServoBus, exchange: ReadBackExchange, off_wire: float)
         return ""
     often = "not at all" if isinf(every) else f"only about every {1e3 * every:.0f} ms"
     return (
-        f"At {1 / bus.config.interval:g} Hz and {bus.port.baud} baud, cycles leave no time to read back what the "
-        f"servos hold: their goals are read back {often}, so another program that writes goals, or a servo that has "
-        f"lost its torque, may be noticed late or never. There is time at {floor(1 / shortest)} Hz or less, or at a "
-        "higher baud rate."
+        f"At {1 / bus.config.interval:g} Hz and {bus.port.baud} baud, cycles leave too little time to read back what "
+        f"the servos hold: their goals are read back {often}, so another program that writes goals, or a servo that "
+        f"has lost its torque, may be noticed late or never. There is enough time at {floor(1 / shortest)} Hz or less, "
+        "or at a higher baud rate."
     )
 
 

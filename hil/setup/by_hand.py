@@ -88,8 +88,8 @@ def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Arr
     angles = tuple(change.tolist())
     if abs(change[most]) < MOVED:
         found = (
-            f"{joint.name!r} did not move: is ID {joint.id} its servo? If a joint that is not in [[joints]] moved "
-            f"instead, the IDs are wrong"
+            f"{joint.name!r} did not move: does ID {joint.id} belong to its servo? If a joint that is not in "
+            "[[joints]] moved instead, the IDs are wrong"
         )
         return Moved(joint.name, asked, angles, False, found)
     if most != asked_for:

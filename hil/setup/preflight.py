@@ -467,7 +467,7 @@ def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:
     found = f"{config.experiment.rate:g} Hz wanted, {report.found}"
     yield Finding(level, "bus", "rate", found, report.fix or report.delayed)
     if seldom:
-        yield Finding(Level.WARNING, "bus", "monitoring", "goals and torque are read back seldom", seldom)
+        yield Finding(Level.WARNING, "bus", "monitoring", "goals and torque are rarely read back", seldom)
 
 
 def _port(config: Config) -> str:

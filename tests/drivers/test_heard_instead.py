@@ -34,12 +34,12 @@ def both(first: int, second: int, *, fast: bool) -> bytes:
 
 @pytest.mark.parametrize("fast", [False, True])
 def test_intact_replies_with_an_id_that_was_not_asked_are_not_called_damaged(fast: bool) -> None:
-    assert said(both(7, 2, fast=fast), fast=fast).startswith("Intact replies came with ID 7, which was not addressed")
+    assert said(both(7, 2, fast=fast), fast=fast).startswith("Intact replies came from ID 7, which was not addressed")
 
 
 @pytest.mark.parametrize("fast", [False, True])
 def test_nor_are_two_replies_with_the_same_id(fast: bool) -> None:
-    assert said(both(2, 2, fast=fast), fast=fast).startswith("Intact replies came with the IDs 2, 2, although")
+    assert said(both(2, 2, fast=fast), fast=fast).startswith("Intact replies came from IDs 2, 2, although")
 
 
 @pytest.mark.parametrize(("ids", "fast"), [((2, 2), False), ((1, 1), False), ((2, 1), False), ((2, 2), True)])
@@ -49,7 +49,7 @@ def test_a_reading_under_another_servos_id_is_no_reading(ids: tuple[int, int], f
     assert None not in cycles.cycle([0, 0]).servos and cycles.heard.mixed_up == 0
     assert cycles.cycle([0, 0]).servos == [None, None]
     assert cycles.heard.mixed_up == 1
-    assert cycles.heard.mixed_up_advice("here").startswith(f"Intact replies came with the IDs {ids[0]}, {ids[1]}, ")
+    assert cycles.heard.mixed_up_advice("here").startswith(f"Intact replies came from IDs {ids[0]}, {ids[1]}, ")
 
 
 def test_replies_out_of_order_because_they_are_late_are_not_taken_for_mixed_up_ones() -> None:

@@ -76,7 +76,7 @@ def test_a_servo_answered_with_anothers_id_is_not_called_silent(answering: int |
 
     port = Mock(clock=clock, baud=1_000_000, latency=1e-3, echoes=False, strangers=0, write=write, read=read)
     port.wire_time.return_value, port.has_input.return_value = 1e-4, False
-    said = "does not answer" if answering is None else "Requests to .* are answered with ID 2 .* mixed up"
+    said = "does not answer" if answering is None else "Requests to .* are answered by ID 2 .* mixed up"
     with pytest.raises(NoReply, match=said):
         Servo(port, 1, load_control_table("XM430-W350")).read("ID")
 

@@ -242,7 +242,7 @@ def test_a_hand_moves_a_joint_while_the_terminal_is_served(serve: Serve, tmp_pat
     [
         (("9:to=1",), "no servo has the ID 9"),
         (("1:to=x",), "must be a number"),
-        (("1",), "give either to"),
+        (("1",), "give either `to`"),
     ],
 )
 def test_a_hand_that_cannot_says_why(
@@ -259,6 +259,6 @@ def test_a_hand_needs_an_arm(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 def test_moves_of_the_command_line_are_described(capsys: pytest.CaptureFixture[str]) -> None:
     assert hil("fake", "koch", "--move", "3:to=0.5,at=2") == 0
-    assert "hand: servo 3 to 0.5 rad at 2 s within 1 s" in capsys.readouterr().out
+    assert "hand: servo 3 to 0.5 rad at 2 s, taking 1 s" in capsys.readouterr().out
     assert hil("fake", "koch", "--move", "7:to=0.5") == 2
     assert "servo = 7" in capsys.readouterr().err

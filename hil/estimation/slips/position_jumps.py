@@ -31,8 +31,8 @@ def jump_warnings(config: Config, facts: RunFacts, samples: NDArray[np.void]) ->
         others = f" ({len(jumps)} jumps in all)" if len(jumps) > 1 else ""
         found.append(
             f"{config.joints[index].name}: the position jumped by {size:+.3f} rad "
-            f"({abs(size) / facts.position_step[index]:.0f} encoder steps) at {time:.2f} s{others}, which the velocity "
-            "before and after does not explain: all later positions are shifted. Check the horn's screws, the "
+            f"({abs(size) / facts.position_step[index]:.0f} encoder steps) at {time:.2f} s{others}. The velocity "
+            "before and after does not explain this: all later positions are shifted. Check the horn's screws, the "
             "encoder's magnet and the cable, then record again."
         )
     return found

@@ -213,7 +213,7 @@ def _verdict(
     if found.simulated:
         worst = float(found.residual_over_noise.max())
         joint = arm.joints[int(np.argmax(found.residual_over_noise))].name
-        sentences.append(f"The largest residual, {joint}'s, is {worst:.2f} times the noise of its angle.")
+        sentences.append(f"The largest residual ({joint}) is {worst:.2f} times the noise of its angle.")
         trust = trust if worst <= EXPLAINED else "with care"
         if found.systematic > SYSTEMATIC:
             trust = "with care"
@@ -269,7 +269,7 @@ def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: b
     """The best verdict that the prediction of the last part allows ("" for any), and why."""
     if foretold is None:
         return "with care", (
-            "The recordings are too short, or end too long after the motion, to check the prediction on a part that "
+            "The recordings are too short, or go on too long after the motion, to check the prediction on a part that "
             "was not fitted.",
         )
     error, wrong = float(np.nanmax(foretold)), TORQUE_WRONG if explained else TORQUE_UNEXPLAINED
@@ -286,7 +286,7 @@ def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: b
 
 def _foretold_said(error: float, joint: str) -> str:
     """Describe the prediction of the last part. error: relative to the RMS torque. joint: the worst one."""
-    part = f"the torque on the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
+    part = f"the torque in the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
     if error > 1.0:
         return (
             f"Fitted to the rest, the model is useless for predicting {part}: the error is {error:.2g} times the "

@@ -207,8 +207,8 @@ def _stop(joint: _Joint) -> list[str]:
             continue
         found.append(
             f"{joint.name[0].upper()}{joint.name[1:]} rebounds at {place:.4g} rad {at.size} times, {_at(time[at])}, "
-            "and never moves past it: it hits a stop or an object there, which no model includes. Use the part before "
-            "the first impact, or record motion that stays clear of it."
+            "and never moves past it: it hits a stop or an object there, and no model includes impacts. Use the part "
+            "before the first impact, or record motion that stays clear of it."
         )
     return found
 

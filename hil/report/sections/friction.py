@@ -32,7 +32,7 @@ def friction(data: RunData) -> Section | None:
     pictures = [_curve(data, joint, name, measured_dots, simulated_dots) for joint, name in enumerate(data.names)]
     words = (
         "Dots: commanded torque minus the model's inertia and gravity torque, once for the measured motion and once "
-        "for the model's own, from positions alone. Deriving accelerations from positions smooths every reversal, so "
+        "for the model's own. Deriving accelerations from positions alone smooths every reversal, so "
         "near standstill both sets deviate equally from the curve; there, static friction can also take any value that "
         "holds the joint. If the friction model is right, the two sets of dots agree.",
     )

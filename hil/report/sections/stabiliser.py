@@ -20,6 +20,6 @@ def stabiliser(data: RunData) -> Section | None:
     words = (
         share.said(data.names),
         "The software spring and damper held the arm at its pose during the periods. The estimate uses the total "
-        "commanded torque, including that of spring and damper, and simulates both together with the arm.",
+        "commanded torque, including that of the spring and damper, and simulates both together with the arm.",
     )
     return Section("stabiliser", "Stabiliser", words, (Table(head, tuple(rows)),))

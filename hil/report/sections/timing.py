@@ -59,5 +59,5 @@ def _histogram(name: str, title: str, values: Array, colour: str) -> Picture:
     counts, edges = np.histogram(values[values <= high], bins=_BINS, range=(low, high))
     series = Series("", edges, counts.astype(np.float64), colour, "steps")
     beyond = int((values > high).sum())
-    more = f" {beyond} of {len(values)} are later than shown." if beyond else ""
+    more = f" {beyond} of {len(values)} values lie beyond the plotted range." if beyond else ""
     return Picture(Chart(name, title, "time [µs]", "samples", (series,)), f"{title}.{more}")

@@ -89,7 +89,7 @@ def about_torque(bus: ServoBus) -> str:
     try:
         on = [joint.title for joint, servo in bus.drives.items() if servo.read("Torque Enable")]
     except DriverError as error:
-        return f"This command has not switched torque on; whether it is off could not be read: {error}"
+        return f"This command has not switched torque on, but could not read whether it is off: {error}"
     if on:
         return f"TORQUE IS ON at {' and '.join(on)}: it was on before this command."
     return _NEVER_ON

@@ -245,7 +245,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
                 left = session.end()
             if bus.port.strangers and not isinstance(stopped, BusShared):
                 left.append(
-                    "Another program has sent packets on this bus while the servos were set up or restored. End it "
+                    "Another program sent packets on this bus while the servos were being set up or restored. End it "
                     "before the next start: it may move the arm."
                 )
             end_with(bus, stopped, left, before)

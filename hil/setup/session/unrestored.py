@@ -45,7 +45,7 @@ def unrestored(
 def _outcome(joints: Sequence[Joint], failed: Mapping[Joint, DriverError]) -> str:
     servos = and_list(map(str, joints))
     if all(failed[joint].in_doubt for joint in joints):
-        return f"Not all settings of {servos} are known to be restored."
+        return f"Some settings of {servos} may not have been restored."
     return f"The settings of {servos} could not be restored."
 
 

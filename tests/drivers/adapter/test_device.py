@@ -59,7 +59,7 @@ def test_a_device_that_another_program_uses_is_refused_and_closed(device: str, m
         patch.setattr("hil.drivers.port.is_pseudo_terminal", lambda _: False)
         patch.setattr("hil.drivers.port.keep_others_out", lambda _: None)
         patch.setattr("hil.drivers.port.other_users", lambda _: ["screen (PID 12)"])
-        with pytest.raises(PortNotOpened, match=r"screen \(PID 12\) has it open too.*Close that program"):
+        with pytest.raises(PortNotOpened, match=r"already open in screen \(PID 12\).*Close that program"):
             open_port(device, 1_000_000)
     open_port(device, 1_000_000).close()
 

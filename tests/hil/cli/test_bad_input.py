@@ -270,7 +270,7 @@ CASES: list[tuple[str, int, str]] = [
     ("fake arm.toml --fault lost_replyy", 2, "Did you mean lost_reply?"),
     ("fake arm.toml --fault lost_reply:probability=2", 2, "probability = 2.0: must be at most 1.0"),
     ("fake arm.toml --fault lost_reply:at=-1", 2, "at = -1.0: must be at least 0.0"),
-    ("fake arm.toml --move 1", 2, 'move "1": give either to (an angle, rad) or ticks'),
+    ("fake arm.toml --move 1", 2, 'move "1": give either `to` (angle, rad) or `ticks`'),
     ("fake arm.toml --move 1:to=nan", 2, "to = nan: must be a finite number"),
     ("fake arm.toml --move 1:to=1,duration=0", 2, "duration = 0.0: must be greater than 0"),
     ("fake arm.toml --seed -1", 2, "--seed"),

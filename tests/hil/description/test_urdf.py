@@ -98,7 +98,7 @@ def test_an_inertia_that_no_body_has_is_a_doubt(tmp_path: Path) -> None:
     [
         (TWO + link("x"), None, "have no parent joint"),
         (TWO + joint("back", "lower", "upper"), None, "loop"),
-        (TWO + "".join(f'<link name="l{n}"/>' for n in range(498)), None, "501 links; at most 500 are read"),
+        (TWO + "".join(f'<link name="l{n}"/>' for n in range(498)), None, "501 links; at most 500 are allowed"),
         (TWO + '<link name="stray"/>' + joint("own", "stray", "stray"), None, "is both its parent and its child"),
         (
             joint("a", "u", "l").join(

@@ -237,7 +237,7 @@ def test_a_servo_is_never_silent_for_longer_than_either_limit(gaps: list[float],
 @pytest.mark.parametrize(
     ("waited", "heard", "said"),
     [
-        (3, "", "while waiting for replies that were lost or damaged. Check the cables"),
+        (3, "", "while this program waited for replies that were lost or damaged. Check the cables"),
         (3, "Bytes arrived, but damaged.", "lost or damaged. Bytes arrived, but damaged."),
         (2, "Bytes arrived, but damaged.", "the replies arrive too late for 400 Hz. `hil check` measures"),
     ],

@@ -119,7 +119,7 @@ TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
         (Kind.CONSTANT, "current", "carries 0.3 A. Its current reading stays the same, its sensor is wrong.", JUMP),
         (Kind.WATCHDOG_LONG, "state", "stops by itself later than intended: its Bus Watchdog reads 127", JUMP),
         (Kind.SHADOWED, "state", "changed the settings (Secondary(Shadow) ID is 1 and was 255)", TWICE),
-        (Kind.IDS_SWAPPED, "state", "Requests to ID 1 are answered with ID 2: the servos' IDs are mixed up.", TWICE),
+        (Kind.IDS_SWAPPED, "state", "Requests to ID 1 are answered by ID 2: the servos' IDs are mixed up.", TWICE),
         (Kind.LAG, "velocity", "is at 1 rad, outside its position limit", "Lower velocity_limit, or raise the voltage"),
     ],
 )

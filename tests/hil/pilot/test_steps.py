@@ -152,7 +152,7 @@ def test_an_inverted_arm_is_identified_with_a_stabiliser(tmp_path: Path) -> None
     shoulder = f"shoulder {share.rms[0]:.3f} of {share.commanded_rms[0]:.3f} N m RMS"
     page = make_page(RunData.load(run.path))
     for said in (console.export_text(), page):
-        assert "Share of torque from the stabiliser" in said and shoulder in said
+        assert "Torque from the stabiliser" in said and shoulder in said
     assert "uses the total commanded torque" in page
 
 
