@@ -104,7 +104,7 @@ class FakeServo(Described):
         for name, value in self.registers.items():
             register = table.get(name)
             if register is None or not register.eeprom or not register.writable:
-                raise ValueError(f'registers: "{name}" is not an EEPROM register of the {self.model} that can be set')
+                raise ValueError(f'registers: "{name}" is not a settable EEPROM register of the {self.model}')
             if not register.minimum <= value <= register.maximum:
                 raise ValueError(f'registers: "{name}" = {value}: {register.minimum} to {register.maximum} is allowed')
         return self

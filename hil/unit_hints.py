@@ -94,7 +94,7 @@ def _fitting(
 
 
 def allowed_by(field: FieldInfo) -> Callable[[float], bool]:
-    """Return whether a number is within the bounds of a field, or of the entries of its list."""
+    """Return whether a number is within the bounds of a field or, if the field is a list, of its entries."""
     bounds = list(_bounds(field))
 
     def keeps(value: float) -> bool:

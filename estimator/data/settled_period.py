@@ -109,7 +109,7 @@ class SettledPeriod:
 
 
 def without_spikes(period: SettledPeriod) -> SettledPeriod:
-    """Return the period with single outliers (such as a bit error on the bus) marked as missing.
+    """Return the period with isolated outliers (such as bit errors cause) marked as missing.
 
     Two distances are computed for each reading: from the median of itself and two neighbours on either side, and from a
     cubic through its neighbours. The reading is an outlier if both exceed SPIKE encoder steps and SPIKE times the

@@ -15,7 +15,7 @@ from hil.estimator.options import ShootingOptions
 from hil.estimator.selection.candidates import Candidate, Linearised, colour, ranked, richer_models, unruled, widened
 
 NOT_HERE: tuple[Option, ...] = ("zeros", "encoder", "ripple", "cogging")
-"""Options that multiple shooting replaces (by the zeros of each recording) or does not support."""
+"""Options that multiple shooting replaces (with the zeros of each recording) or does not support."""
 COARSE = ShootingOptions().coarse_step
 KNOWN_SHARE = 1.0 / 3.0  # fraction of a held-out segment that determines its initial state; the rest is predicted
 STATE_STEPS = 6

@@ -150,7 +150,7 @@ class Controller:
         return self._position_control(goals, position_ticks, abs(goals.pwm))
 
     def _moving_status(self, position_ticks: float) -> int:
-        """Return the register Moving Status. The firmware's threshold for a following error is uncertain."""
+        """Return the Moving Status register. The firmware's threshold for a following error is uncertain."""
         goals = self.goals
         if goals is None or goals.mode not in POSITION_MODES:
             return 0

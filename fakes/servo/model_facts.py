@@ -43,7 +43,7 @@ class Motor(NamedTuple):
 
     @property
     def back_emf_v_s(self) -> float:
-        """Back-EMF per velocity of the output shaft [V s/rad]."""
+        """Back-EMF per unit velocity of the output shaft [V s/rad]."""
         return float(f"{self.voltage_v / (self.no_load_rpm * math.tau / 60):.3g}")
 
 

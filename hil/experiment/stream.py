@@ -134,7 +134,7 @@ class Stream:
         self._segment = 0
         self._state: State | None = None
         self._whole: State | None = None
-        """The latest state with replies of all servos."""
+        """The latest state with replies from all servos."""
         self._sampled: State | None = None
         self._is_undriven = True
         """Whether nothing has driven the arm yet; a stabiliser cannot drive it before the first sample."""

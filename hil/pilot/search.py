@@ -300,7 +300,7 @@ class Search:
         return self.player.play(config if self.pose is None else _from_anywhere(config), folder, name, found, arms)
 
     def waves(self, config: Config) -> Plan:
-        """Design the waves of the full run for the arm as currently believed."""
+        """Design the waves of the full run for the arm as currently estimated."""
         arm = Physics.of(self.belief.middle)
         if config.experiment.design == "optimal":
             return designed_plan(config, arm, [name for name in self.belief.names if _is_base(name)])

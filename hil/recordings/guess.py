@@ -149,8 +149,8 @@ def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
     lengths = [name for name in table.columns if (table.units.get(name) or split_head(name)[1] or "") in _LENGTHS]
     if what == "position" and not some and lengths:
         return CsvError(
-            f"{table.source}: {', '.join(lengths)} {'is a length' if len(lengths) == 1 else 'are lengths'}: the angle "
-            "of each joint is needed (rad, deg, turns or ticks), from the base outwards. The position of the "
+            f"{table.source}: {' and '.join(lengths)} {'is a length' if len(lengths) == 1 else 'are lengths'}, but the "
+            "angle of each joint is needed (rad, deg, turns or ticks), from the base outwards. The position of the "
             "tip does not determine the joint angles; record the encoders, or compute the angles first."
         )
     seen = f"several are candidates ({', '.join(some[:12])})" if some else "none has a recognisable name"

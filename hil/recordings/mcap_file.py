@@ -86,7 +86,7 @@ def _table(source: str, files: list[Path]) -> Table:
 
 
 def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
-    """Yield (topic, time [ns since 1970], message) of each decodable message. Raises CsvError if there is none."""
+    """Yield (topic, time [ns since 1970], message) for each decodable message. Raises CsvError if there is none."""
     try:
         from mcap.exceptions import UnsupportedCompressionError
         from mcap.reader import make_reader

@@ -20,7 +20,7 @@ AFTER_A_RUN = 2.0
 """
 
 NEAR_RAD = 0.02
-"""Deviation up to which arm.rest_pose is used although the arm is not exactly there [rad]."""
+"""Largest deviation at which arm.rest_pose is still used even if the arm is not exactly in it [rad]."""
 
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
 """Smallest reported motion after torque is cut, and largest deviation from the rest pose before that motion [rad]."""

@@ -56,8 +56,8 @@ def set_up(
 ) -> list[Change]:
     """Change the settings whose requested and current values differ, each after `confirm` has agreed.
 
-    The port is left at the baud rate at which the servo was last heard. A status packet lost while ID or baud rate
-    changes is not a failure: the servo is searched for at both the old and the new value.
+    The port is left at the baud rate at which the servo was last heard. A status packet lost while the
+    ID or the baud rate changes is not a failure: the servo is searched for at both the old and the new value.
 
     Raises ServoRefused if a register does not read back as written, WrongSetting if the new ID is taken, and the
     errors of `Servo.read`.

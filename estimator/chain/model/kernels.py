@@ -32,9 +32,9 @@ MASS, MOMENT, INERTIA, MOMENTUM, FLOW, FORCE, BODY = 0, 1, 4, 10, 13, 22, 28
 def room(joints: int) -> Any:
     """Return the work arrays for the functions below.
 
-    frame    rotation by rows and origin of each link (joints, 12)
+    frame    rotation matrix (row by row) and origin of each link (joints, 12)
     motion   joint axis; velocity; acceleration, with gravity as an upward acceleration; time derivative of the axis;
-             cross product of the previous link's velocity and the axis; that of its acceleration (joints, 6, 6)
+             cross products of the previous link's velocity and of its acceleration with the axis (joints, 6, 6)
     body     columns MASS to FORCE; single links, then composites (2, joints, BODY)
     seized   composite inertia times axis (joints, 6)
     mass     mass matrix (joints, joints)

@@ -30,7 +30,7 @@ class _Seen(NamedTuple):
 
 
 class PositionSteps:
-    """Corrects the positions of the exchanges after `state`, which all servos answered."""
+    """Corrects the positions read after `state`, an exchange that all servos answered."""
 
     def __init__(self, state: State) -> None:
         at = state.time_before_write

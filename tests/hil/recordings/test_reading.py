@@ -427,7 +427,7 @@ def test_a_right_recording_is_not_refused() -> None:
 def test_lengths_are_no_angles(tmp_path: Path) -> None:
     path = tmp_path / "tip.csv"
     path.write_text("t,x [mm],y [mm],tau1,tau2\n0,1,2,0,0\n", encoding="utf-8")
-    with pytest.raises(CsvError, match=r"x \[mm\], y \[mm\] are lengths"):
+    with pytest.raises(CsvError, match=r"x \[mm\] and y \[mm\] are lengths"):
         convert(read_tables(path)[0], Columns())
 
 
