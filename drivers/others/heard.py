@@ -142,7 +142,7 @@ class Heard:
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
 
     def _is_anothers(self, servo_id: int, length: int) -> bool:
-        """Whether an apparently truncated instruction is another master's, rather than a damaged reply with this LEN."""
+        """Whether an apparently truncated instruction is another master's, not a damaged reply with this LEN."""
         lengths = {size + _BESIDE_DATA for _, size in self._expected}
         return servo_id in (*self._ids, BROADCAST_ID) and length <= _LONGEST_CUT_OFF and length not in lengths
 

@@ -80,7 +80,7 @@ def test_servos_may_have_the_same_id(tmp_path: Path) -> None:
         (FIRST, FIRST.replace("XM430-W350", "motor"), ["fake.servos[1].model = 'motor'", "XM430-W350, XM430-W210"]),
         (FIRST, FIRST.replace("id = 1", "id = 253"), ["fake.servos[1].id = 253", "252"]),
         (FIRST, "", ["1 servos for 2 drives"]),
-        (FIRST, FIRST + 'registers = { "Goal Current" = 1 }\n', ["Goal Current", "not an EEPROM register"]),
+        (FIRST, FIRST + 'registers = { "Goal Current" = 1 }\n', ["Goal Current", "not a settable EEPROM register"]),
         (FIRST, FIRST + 'registers = { "Shutdown" = 256 }\n', ["Shutdown", "0 to 255 is allowed"]),
         ("gear_ratio = 353.5", "gear_ratio = 0.0", ["fake.arm.drives[1].gear_ratio = 0.0", "greater than 0"]),
     ],
