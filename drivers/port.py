@@ -31,6 +31,9 @@ _now = time.perf_counter
 _FAILURES = (OSError, termios.error)
 # OSError covers SerialException. An unplugged cable makes flushing the input raise termios.error, which is no OSError.
 
+_PENDING_FAILURES = (*_FAILURES, TypeError)
+# pyserial counts the pending bytes of a port without checking whether it has been closed.
+
 _REASONS = {
     "No such file": "there is no such device",
     "Inappropriate ioctl": "it is not a serial port",
@@ -207,14 +210,14 @@ class Port:
         """Move received but unread bytes to `overheard`."""
         try:
             self.overheard = self._serial.read(self._serial.in_waiting)
-        except _FAILURES as error:
+        except _PENDING_FAILURES as error:
             raise self._lost(error) from error
 
     def has_input(self) -> bool:
         """Return whether received bytes are waiting to be read."""
         try:
             return bool(self._serial.in_waiting)
-        except _FAILURES as error:
+        except _PENDING_FAILURES as error:
             raise self._lost(error) from error
 
     def discard_input(self) -> None:
@@ -314,7 +317,9 @@ class DescriptorPort(Port):
 
     def reopen(self) -> bool:
         # The device may have another name now, and its former name may be that of another arm's adapter.
-        self._serial.close()
+        self._forget_descriptor()
+        with contextlib.suppress(*_FAILURES):
+            self._serial.close()
         device = device_of(self._adapter)
         if device is None:
             return False
@@ -415,10 +420,13 @@ class DescriptorPort(Port):
             raise self._lost(error) from error
 
     def close(self) -> None:
-        # The closed descriptor number may soon be reused for another file, so it must not be used again.
+        self._forget_descriptor()
+        super().close()
+
+    def _forget_descriptor(self) -> None:
+        """Never use the closed descriptor's number again, since it may soon be that of another file."""
         self._descriptor = -1
         self._wait_ms = _never_ready
-        super().close()
 
     def _read_on(self, received: bytes, count: int, deadline: float) -> bytes:
         """Read the rest of a fragmented reply. Uses select because poll only has a resolution of one millisecond."""

@@ -160,6 +160,11 @@ def test_an_adapter_that_was_reset_is_used_again_under_its_new_name(
     assert not port.reopen(), "it is not back"
     with pytest.raises(PortLost):
         port.write(b"x")
+    for use in (port.has_input, port.put_aside, port.discard_input, lambda: port.read(1, 0.0)):
+        with pytest.raises(PortLost):
+            use()
+    with pytest.raises(PortLost):
+        port.ask(b"y", 1, port.reply_time(0.0, 1), port.clock.now())
     plugged["usb-A"] = device
     assert port.reopen() and port.url == device
     port.write(b"x")
