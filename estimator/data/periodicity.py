@@ -13,6 +13,7 @@ from hil.estimator.errors import ShapeError
 EVEN = 1.1  # maximum ratio of successive changes in a decreasing sequence
 SLOWEST = 0.97  # largest mean ratio of successive changes that still counts as decreasing
 SLOWLY = 0.65  # minimum ratio of successive changes while friction warms up, which takes many periods
+WARMEST = 0.25  # largest change from period to period while friction warms up
 ALIKE = (
     0.8  # minimum correlation of successive changes while friction warms up, as it always changes in the same direction
 )
@@ -62,17 +63,19 @@ def settling_difference(former: Array, latest: Array) -> float:
 class Decay:
     """A change from period to period that decreases by about the same factor each time.
 
-    ratio: that factor. further: number of further periods until the change is within tolerance.
+    ratio: that factor. further: number of further periods until the change is within tolerance. latest: the latest
+    change.
     """
 
     ratio: float
     further: int
+    latest: float
 
-    def is_warming(self, correlation: float) -> bool:
-        """Return whether the change looks like friction falling during warm-up rather than a transient.
+    def is_drift(self, correlation: float) -> bool:
+        """Return whether the change looks like a drift of friction or torque rather than a transient.
 
-        During warm-up the motion keeps changing in the same direction over many periods; a transient oscillates or
-        decays faster. correlation: see `correlation_of_changes`.
+        A drift keeps changing the motion in the same direction over many periods; a transient oscillates or decays
+        faster. correlation: see `correlation_of_changes`.
         """
         return self.ratio >= SLOWLY and correlation >= ALIKE
 
@@ -94,7 +97,7 @@ def decay_of(differences: Sequence[float], within: float) -> Decay | None:
     if not ratio <= SLOWEST:
         return None
     further = max(1, math.ceil(math.log(within / falling[-1]) / math.log(ratio)))
-    return Decay(ratio, further) if len(differences) + further <= MOST_PERIODS else None
+    return Decay(ratio, further, falling[-1]) if len(differences) + further <= MOST_PERIODS else None
 
 
 def correlation_of_changes(position: Array) -> float:

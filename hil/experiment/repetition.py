@@ -112,7 +112,12 @@ class Repetition:
         """RMS difference between the second halves of the periods, relative to the RMS of the motion, for the worst
         joint.
         """
-        return max(_relative(sums) for sums in self._sums)
+        return max(map(_relative, self._sums))
+
+    @property
+    def worst(self) -> int:
+        """Index of the joint whose motion differs most."""
+        return int(np.argmax([_relative(sums) for sums in self._sums]))
 
 
 def _rms_change(sums: Any) -> float:

@@ -24,7 +24,7 @@ from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
 from hil.estimator.arrays import Array
 from hil.estimator.chain.simulation.rollout import ChainArms
-from hil.estimator.data.periodicity import correlation_of_changes, decay_of
+from hil.estimator.data.periodicity import WARMEST, correlation_of_changes, decay_of
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.checks.apart import opposed
 from hil.experiment.guard import Guard
@@ -293,11 +293,18 @@ class Stream:
             return "Check for backlash, a dragging cable or a slipping joint, or raise max_settling_periods."
         listed = ", ".join(f"{each:.1%}" for each in differences)
         played = len(differences) + decay.further
-        if decay.is_warming(self._correlation(samples)):
+        drifts = decay.is_drift(self._correlation(samples))
+        if drifts and decay.latest <= WARMEST:
             seconds = (self._plan.warm_up_periods + played) * samples * self._pace.interval
             return (
                 f"The change decreases slowly from period to period ({listed}), as happens while grease warms up: set "
                 f"experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
+            )
+        if drifts:
+            return (
+                f"{self._bus.joints[self._repetition.worst].title} changes most ({listed}): friction may hold it for "
+                "part of each period, or its torque may have changed. Raise its experiment.peak_torque if `hil "
+                "dry-run` allows it; otherwise, check its supply and look for a dragging cable or a slipping joint."
             )
         return (
             f"The change decreases from period to period ({listed}), by a factor of {decay.ratio:.2g} each time: the "

@@ -172,9 +172,9 @@ def test_a_steady_decrease_is_told_from_play_and_tells_the_time_it_takes() -> No
         assert decay_of(others, 1e-5) is None
 
 
-@pytest.mark.parametrize(("ratio", "turned", "warms"), [(0.8, False, True), (0.8, True, False), (0.5, False, False)])
+@pytest.mark.parametrize(("ratio", "turned", "drifts"), [(0.8, False, True), (0.8, True, False), (0.5, False, False)])
 def test_warming_friction_changes_the_motion_slowly_and_always_in_the_same_direction(
-    ratio: float, turned: bool, warms: bool
+    ratio: float, turned: bool, drifts: bool
 ) -> None:
     wave = np.sin(np.linspace(0.0, 2.0 * np.pi, 101)[:-1])
     sizes = np.cumsum([0.0, *(0.1 * (-ratio if turned else ratio) ** n for n in range(5))])
@@ -182,4 +182,4 @@ def test_warming_friction_changes_the_motion_slowly_and_always_in_the_same_direc
     periods[-2, 0, 77] = np.nan
     decay = decay_of(period_difference(periods).relative[:, 0].tolist(), 1e-3)
     assert decay is not None
-    assert decay.is_warming(correlation_of_changes(periods[-3:])) is warms
+    assert decay.is_drift(correlation_of_changes(periods[-3:])) is drifts

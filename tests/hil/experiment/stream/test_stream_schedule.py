@@ -228,7 +228,7 @@ def settle(stream: Stream, differences: list[float], moved: float = 1.0, since: 
     moved: how far the elbow moves in the periods from `since` on [rad].
     """
     played: list[int] = []
-    repetition = stream._repetition = SimpleNamespace(difference=math.nan, moved=(1.0, 1.0))  # type: ignore[assignment]
+    repetition = stream._repetition = SimpleNamespace(difference=math.nan, moved=(1.0, 1.0), worst=1)  # type: ignore[assignment]
 
     def play_period(_: Segment, period: int) -> None:
         played.append(period)
@@ -268,6 +268,11 @@ def test_what_never_settles_is_refused_with_the_time_that_it_takes(make: Make, m
     monkeypatch.setattr(stream, "_correlation", lambda _: 0.95)
     with pytest.raises(NotSettled, match=r"50\.0%, 20\.0%, 18\.0%, .*set experiment\.warm_up = 530\.") as stop:
         settle(stream, [0.5, 0.2, 0.18, 0.162, 0.1458])  # 26 more periods: (2 + 5 + 26) * 16 s = 528 s
+    stream, _, _ = make(max_settling_periods=5)
+    monkeypatch.setattr(stream, "_correlation", lambda _: 0.95)
+    with pytest.raises(NotSettled, match=r"Joint 'elbow'.* changes most .*friction may hold it") as stop:
+        settle(stream, [3.7, 2.3, 2.0, 1.5, 0.95])
+    assert "grease" not in str(stop.value)
 
 
 @pytest.mark.parametrize(("steps", "is_enough"), [(4.1, True), (3.9, False)])
