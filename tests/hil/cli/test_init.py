@@ -158,7 +158,7 @@ def test_friction_that_holds_the_arm_aside_is_read_from_both_sides(arm_file: Arm
 
 @pytest.mark.parametrize(("sustained", "chosen"), [(52.0, 40), (900.0, 400), (370.0, 300), (23.0, 20), (61.0, 50)])
 def test_the_highest_rate_with_a_margin_is_chosen(sustained: float, chosen: int) -> None:
-    mode = ExchangeMode(True, True, 0.001, SHARE / sustained, 0.05, 0)
+    mode = ExchangeMode(True, True, 0.001, SHARE / sustained, 0.001, 0.05, 0)
     bus = SimpleNamespace(config=SimpleNamespace(fast_sync_read=True, one_write=True))
     assert choose_mode(bus, [mode], RATES)[1] == chosen  # type: ignore[arg-type]
 

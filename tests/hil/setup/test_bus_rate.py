@@ -47,17 +47,20 @@ def test_a_rate_that_leaves_no_time_to_read_goals_back_is_said(arm_file: ArmFile
 
 
 @pytest.mark.parametrize(
-    ("times", "fix"),
+    ("times", "slowest", "fix"),
     [
-        ([6e-3, 2e-3], ""),
-        ([6e-3, 6e-3], "Half of the exchanges are fast enough, so other programs may be keeping"),
-        ([2e-3], ""),
+        ([6e-3, 2e-3], 1.5e-3, ""),
+        ([6e-3, 6e-3], 1.5e-3, "Half of the exchanges are fast enough, so other programs may be keeping"),
+        ([6e-3, 6e-3], 6e-3, "Set experiment.rate to at most 150"),
+        ([2e-3], 1.5e-3, ""),
     ],
 )
 def test_a_rate_is_refused_only_if_it_is_too_high_twice(
-    times: list[float], fix: str, monkeypatch: pytest.MonkeyPatch
+    times: list[float], slowest: float, fix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mode = ExchangeMode(one_write=True, fast=False, median_s=1.5e-3, usual_s=0.0, longest_s=8e-3, lost=0)
+    mode = ExchangeMode(
+        one_write=True, fast=False, median_s=1.5e-3, usual_s=0.0, slowest_s=slowest, longest_s=8e-3, lost=0
+    )
     measured = iter(times)
     monkeypatch.setattr(bus_rate, "measure_modes", lambda _: [replace(mode, usual_s=next(measured))])
     settings = SimpleNamespace(fast_sync_read=False, one_write=True)
