@@ -23,7 +23,18 @@ SCRIPTS = sorted(
     if "__main__" in path.read_text(encoding="utf-8") and path.stem != NEEDS_A_CLIENT
 )
 LOADED = [
-    *("numpy", "scipy.optimize", "scipy.stats", "scipy.signal", "numba", "pydantic", "serial", "rich", "typer", "pytest"),
+    *(
+        "numpy",
+        "scipy.optimize",
+        "scipy.stats",
+        "scipy.signal",
+        "numba",
+        "pydantic",
+        "serial",
+        "rich",
+        "typer",
+        "pytest",
+    ),
     *("hil.api.dry_run", "hil.api.estimate", "hil.api.experiment", "hil.estimation.settled_estimate", "hil.pilot"),
 ]
 """What most scripts import, directly or not: it takes most of their time."""

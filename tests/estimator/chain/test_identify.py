@@ -89,7 +89,9 @@ def test_missing_samples_cost_little(setup: bench.Setup, period: SettledPeriod, 
 def test_what_the_data_do_not_show_is_said(setup: bench.Setup, short_period: SettledPeriod) -> None:
     """With ten times coarser encoders, some base parameters come from the description."""
     step = 40 * short_period.position_step
-    coarse = replace(short_period, position=np.round(short_period.position / step[:, None]) * step[:, None], position_step=step)
+    coarse = replace(
+        short_period, position=np.round(short_period.position / step[:, None]) * step[:, None], position_step=step
+    )
     found = identify_chain(coarse, ChainModel(setup.base, friction="coulomb"), setup.prior)
     assert found.from_prior
     assert set(found.from_prior) < set(setup.base.names)

@@ -25,9 +25,7 @@ def ready(seconds: float) -> tuple[bench.Setup, Motion]:
     return setup, bench.path_of(BENCH, setup, 101, seconds)
 
 
-def identified(
-    noise: float | np.ndarray = 0.0, first: int = 0, seconds: float = 5.0, **effect: float
-) -> ChainEstimate:
+def identified(noise: float | np.ndarray = 0.0, first: int = 0, seconds: float = 5.0, **effect: float) -> ChainEstimate:
     """Estimate of the four-joint arm with noisy encoders, and with an effect on its drives from `first` on."""
     setup, path = ready(seconds)
     every = setup.arm.drives

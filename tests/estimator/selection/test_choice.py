@@ -30,9 +30,7 @@ def worst(parameters: dict[str, float], arm: Arm) -> float:
     return max(abs(parameters[name] / true - 1.0) for name, true in truth.items() if not name.startswith("offset"))
 
 
-def test_the_plain_model_is_kept_where_nothing_more_is_true(
-    pendulum: Arm, recorded: Recorder, wave: Wave
-) -> None:
+def test_the_plain_model_is_kept_where_nothing_more_is_true(pendulum: Arm, recorded: Recorder, wave: Wave) -> None:
     period, other = (recorded(pendulum, wave(seed, (0.4,), 5.0)) for seed in (1, 2))
     choice = choose([period], other, "delay")
     assert choice.estimate.model == Model(1, "coulomb", "delay")

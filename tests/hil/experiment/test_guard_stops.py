@@ -42,7 +42,11 @@ def swing_elbow(ports: list[Any], velocity: float) -> None:
     plant._state = (*plant._state[:3], velocity, *plant._state[4:])
 
 
-SHORTER = (("period = 2.0 ", "period = 1.0 "), ("band = [0.5, 6.0]", "band = [1.0, 6.0]"), ("ramp = 1.0 ", "ramp = 0.5 "))
+SHORTER = (
+    ("period = 2.0 ", "period = 1.0 "),
+    ("band = [0.5, 6.0]", "band = [1.0, 6.0]"),
+    ("ramp = 1.0 ", "ramp = 0.5 "),
+)
 """Half a run, because its time is proportional to its samples."""
 
 
