@@ -162,9 +162,9 @@ def set_up(bench: Bench, seed: int) -> Setup:
 
 
 @remembered
-def path_of(bench: Bench, setup: Setup, seed: int) -> Motion:
+def path_of(bench: Bench, setup: Setup, seed: int, seconds: float = PERIOD) -> Motion:
     centre, swing, speed = (np.array(each, dtype=float) for each in (bench.centre, bench.swing, bench.speed))
-    return design_path(setup.base, setup.prior, RATE, PERIOD, HIGHEST, centre, swing, speed, seed)
+    return design_path(setup.base, setup.prior, RATE, seconds, HIGHEST, centre, swing, speed, seed)
 
 
 @remembered

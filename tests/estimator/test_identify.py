@@ -48,7 +48,18 @@ def held_out_error(estimate: Estimate, period: SettledPeriod) -> np.ndarray:
 RIGID = ("inertia", "coupling", "armature")
 
 
-@pytest.mark.parametrize(("seed", "peak"), [(1, (0.8, 0.42)), (2, (0.6, 0.35)), (3, (0.8, 0.42)), (16, (0.7, 0.4))])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    ("seed", "peak"),
+    [
+        (1, (0.8, 0.42)),
+        (2, (0.6, 0.35)),
+        pytest.param(3, (0.8, 0.42), marks=SLOW),  # needs further starts, and so several times the time
+        pytest.param(16, (0.7, 0.4), marks=SLOW),
+    ],
+)
 def test_ideal_arm_within_a_fifth_of_a_percent(
     ideal_arm: Arm, recorded: Recorder, wave: Wave, seed: int, peak: tuple[float, float]
 ) -> None:

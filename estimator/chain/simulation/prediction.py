@@ -35,21 +35,25 @@ def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeri
     simulation = Simulation(model.base, as_moving(model.base, parameters), start, np.zeros((2, joints)))
     missing, slopes = np.full((1, joints), np.nan), np.zeros((1, steps, 2, joints))
     torque = np.empty((1, steps, joints))
+    one = ChainRun(torque, slopes, missing, step, FINER)
+    stiffness, damping, pose, most = feedback.stiffness, feedback.damping, feedback.pose, feedback.limit
+    least, sample, given = -most, slice(0, 1), np.ascontiguousarray(excitation.T)
     former = start.copy()
-    motor = np.clip(excitation[:, -1], -feedback.limit, feedback.limit)
-    positions = np.empty((joints, samples))
+    motor = np.minimum(np.maximum(given[-1], least), most)
+    positions = np.empty((samples, joints))
     for k in range(PERIODS * samples):
-        wanted = excitation[:, k % samples] + feedback.stiffness * (feedback.pose - former[0])
-        command = np.clip(wanted - feedback.damping * former[1], -feedback.limit, feedback.limit)
+        wanted = given[k % samples] + stiffness * (pose - former[0])
+        command = np.minimum(np.maximum(wanted - damping * former[1], least), most)
         former = simulation.state.copy()
         for s in range(steps):
-            torque[0, s] = command + (motor - command) * share
-            motor = motor + (command - motor) * fallen
-        position, _ = simulation.go_on(ChainRun(torque, slopes, missing, step, FINER), slice(0, 1))
+            lead = motor - command
+            torque[0, s] = command + lead * share
+            motor = motor - lead * fallen
+        position, _ = simulation.go_on(one, sample)
         if position is None:
             raise PeriodicityError("with these parameters the simulated arm diverges from the measured motion")
-        positions[:, k % samples] = position[0]
-    return positions
+        positions[k % samples] = position[0]
+    return np.ascontiguousarray(positions.T)
 
 
 def _commands(period: SettledPeriod) -> tuple[Array, Feedback]:

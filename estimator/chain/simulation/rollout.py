@@ -175,14 +175,17 @@ def inertias(arms: ChainArms, poses: Array) -> tuple[Array, Array]:
     n = arms.base.chain.joints
     work, still = room(n), np.zeros(n)
     rotation, translation, axis, _ = arms.base.chain.arrays
-    held, free = np.zeros((arms.size, n)), np.full((arms.size, n), np.inf)
+    held, free = np.empty((arms.size, n)), np.empty((arms.size, n))
+    mass = np.empty((len(poses), n, n))
     for arm in range(arms.size):
         link, armature = _split(arms, arm)
-        for pose in np.ascontiguousarray(poses, dtype=np.float64):
+        for pose, matrix in zip(np.ascontiguousarray(poses, dtype=np.float64), mass, strict=True):
             place(rotation, translation, axis, pose, work[0], work[1])
             move(link, armature, still, work)
-            held[arm] += np.diag(work[4]) / len(poses)
-            free[arm] = np.minimum(free[arm], 1.0 / np.diag(linalg.inv(work[4])))
+            matrix[:] = work[4]
+        # The sum of a column of np.cumsum, unlike that of np.sum, does not depend on how many columns there are.
+        held[arm] = np.cumsum(np.diagonal(mass, axis1=1, axis2=2) / len(poses), axis=0)[-1]
+        free[arm] = (1.0 / np.diagonal(linalg.inv(mass), axis1=1, axis2=2)).min(axis=0)
     return held, free
 
 

@@ -118,7 +118,7 @@ class Simulation:
             *(*self._arm, torque, run_.slopes[piece], measured),
             *(self._gain, run_.step, run_.finer, self._columns, self._room, position, derivative),
         )
-        return (position if stayed and np.all(np.isfinite(position)) else None), derivative
+        return (position if stayed and np.isfinite(position).all() else None), derivative
 
 
 def _aligned(rows: int, columns: int) -> Array:

@@ -26,7 +26,7 @@ def test_the_mass_acts_like_the_same_mass_in_the_fake_arm(setup: bench.Setup) ->
 
 
 def test_wrong_torque_constants_are_found_and_the_parameters_are_in_true_units(setup: bench.Setup) -> None:
-    path = bench.path_of(bench.BENCHES[4], setup, 101)
+    path = bench.path_of(bench.BENCHES[4], setup, 101, 5.0)
     loaded = replace(setup, arm=setup.arm.model_copy(update={"payload": MASS.mass, "payload_at": MASS.at}))
     recorded = [bench.record(bench.BENCHES[4], each, path) for each in (setup, loaded)]
     assumed = [replace(each, torque=each.torque / TRUE_OVER_ASSUMED[:, None], stabiliser=None) for each in recorded]

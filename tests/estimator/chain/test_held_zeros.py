@@ -13,7 +13,7 @@ from hil.estimator.chain.model.chain_model import ChainModel
 
 def test_a_zero_that_gravity_reveals_is_doubted_and_right_ones_are_not() -> None:
     setup = bench.set_up(bench.BENCHES[4], 1)
-    period = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101))
+    period = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101, 5.0))
     model = ChainModel(setup.base)
     assert identify_chain(period, model, setup.prior, test_zeros=True).doubtful_zeros == ()
     shifted = period.position.copy()

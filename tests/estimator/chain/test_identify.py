@@ -34,6 +34,12 @@ def period(setup: bench.Setup) -> SettledPeriod:
 
 
 @pytest.fixture(scope="module")
+def short_period(setup: bench.Setup) -> SettledPeriod:
+    """For tests of what a fit finds, rather than of how accurate it is."""
+    return bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101, 5.0))
+
+
+@pytest.fixture(scope="module")
 def estimate(setup: bench.Setup, period: SettledPeriod) -> ChainEstimate:
     return identify_chain(period, ChainModel(setup.base), setup.prior)
 
@@ -51,8 +57,9 @@ def test_torque_friction_and_residual(setup: bench.Setup, estimate: ChainEstimat
 
 
 def test_stage_2_is_several_times_better_than_filtered_least_squares(
-    setup: bench.Setup, period: SettledPeriod, estimate: ChainEstimate
+    setup: bench.Setup, period: SettledPeriod, estimate: ChainEstimate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(bench, "foretold", lambda *_: None)  # a figure of the benchmark that takes most of the time
     other = bench.path_of(bench.BENCHES[4], setup, 201)
     ours = bench.errors(setup, estimate.value[: setup.base.count], other)
     held_out = bench.record(bench.BENCHES[4], setup, other)
@@ -80,10 +87,12 @@ def test_missing_samples_cost_little(setup: bench.Setup, period: SettledPeriod, 
     np.testing.assert_array_less(np.abs(found.value - estimate.value), 4 * estimate.std + 1e-9)
 
 
-def test_what_the_data_do_not_show_is_said(setup: bench.Setup, period: SettledPeriod) -> None:
+def test_what_the_data_do_not_show_is_said(setup: bench.Setup, short_period: SettledPeriod) -> None:
     """With ten times coarser encoders, some base parameters come from the description."""
-    step = 40 * period.position_step
-    coarse = replace(period, position=np.round(period.position / step[:, None]) * step[:, None], position_step=step)
+    step = 40 * short_period.position_step
+    coarse = replace(
+        short_period, position=np.round(short_period.position / step[:, None]) * step[:, None], position_step=step
+    )
     found = identify_chain(coarse, ChainModel(setup.base, friction="coulomb"), setup.prior)
     assert found.from_prior
     assert set(found.from_prior) < set(setup.base.names)
@@ -157,24 +166,26 @@ def test_wrong_torque_constants_are_found(setup: bench.Setup, period: SettledPer
     assert np.all(np.abs(ratios - 1.0) > 10.0 * std)
 
 
-def test_auto_adds_what_the_recording_shows(setup: bench.Setup, period: SettledPeriod) -> None:
+def test_auto_adds_what_the_recording_shows(
+    setup: bench.Setup, period: SettledPeriod, short_period: SettledPeriod
+) -> None:
     """An encoder whose zero is off is found; a recording that is explained keeps the plain model."""
     plain = choose_chain(period, ChainModel(setup.base), setup.prior)
     assert plain.estimate.model == ChainModel(setup.base)
     assert len(plain.trials) == 1
-    shifted = period.position.copy()
-    shifted[1] -= 0.06
-    choice = choose_chain(replace(period, position=shifted), ChainModel(setup.base), setup.prior)
+    shifted = short_period.position.copy()
+    shifted[1] -= 0.08
+    choice = choose_chain(replace(short_period, position=shifted), ChainModel(setup.base), setup.prior)
     assert choice.gained > 1.02
     assert choice.trials[0].model == ChainModel(setup.base)
     found = choice.estimate
     assert found.model.zeros
-    assert found.parameters["zero_2"] == pytest.approx(0.06, abs=0.01)
+    assert found.parameters["zero_2"] == pytest.approx(0.08, abs=0.01)
 
 
 def test_a_tilted_base_is_found(setup: bench.Setup) -> None:
     real = replace(setup, arm=setup.arm.model_copy(update={"base": (0.04, -0.02, 0.0)}))
-    path = bench.path_of(bench.BENCHES[4], setup, 101)
+    path = bench.path_of(bench.BENCHES[4], setup, 101, 5.0)
     tilted_period = bench.record(bench.BENCHES[4], real, path)
     base = BaseParameters.of(setup.base.chain, tilts=True)
     prior = Prior.of(base, setup.arm.description.parameters)

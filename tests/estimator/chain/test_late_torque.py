@@ -36,7 +36,7 @@ def setup() -> bench.Setup:
 
 @pytest.fixture(scope="module")
 def period(setup: bench.Setup) -> SettledPeriod:
-    return bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101))
+    return bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101, 5.0))
 
 
 def test_lags_that_differ_are_found(setup: bench.Setup, period: SettledPeriod) -> None:

@@ -19,15 +19,15 @@ NOISE = np.array([0.34, 0.0, 0.13, 0.5])
 
 
 @cache
-def ready() -> tuple[bench.Setup, Motion]:
+def ready(seconds: float) -> tuple[bench.Setup, Motion]:
     """The four-joint arm and its path, whose design takes longer than the fit."""
     setup = bench.set_up(BENCH, 1)
-    return setup, bench.path_of(BENCH, setup, 101)
+    return setup, bench.path_of(BENCH, setup, 101, seconds)
 
 
-def identified(noise: float | np.ndarray = 0.0, first: int = 0, **effect: float) -> ChainEstimate:
+def identified(noise: float | np.ndarray = 0.0, first: int = 0, seconds: float = 5.0, **effect: float) -> ChainEstimate:
     """Estimate of the four-joint arm with noisy encoders, and with an effect on its drives from `first` on."""
-    setup, path = ready()
+    setup, path = ready(seconds)
     every = setup.arm.drives
     drives = (*every[:first], *(drive.model_copy(update=effect) for drive in every[first:]))
     real = replace(setup, arm=setup.arm.model_copy(update={"drives": drives}))
@@ -45,7 +45,7 @@ def test_an_effect_that_hides_in_rounding_is_seen(effect: dict[str, float]) -> N
 
 
 def test_a_complete_model_is_not_suspected() -> None:
-    found = identified()
+    found = identified(seconds=10.0)
     assert found.systematic < 0.7 * SYSTEMATIC
     assert found.explained
     larger = replace(found, residual=found.residual * 1.1 * EXPLAINED_RESIDUAL / found.over_noise.max())

@@ -63,7 +63,7 @@ def setup() -> bench.Setup:
 def test_an_unfinished_fit_is_said_covers_the_truth_and_blames_no_prior(
     setup: bench.Setup, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    period = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101))
+    period = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101, 5.0))
     hasty = ChainOptions(ftol_coarse=0.1, ftol_near=0.1, ftol_nearer=0.1, ftol=0.1, other_initial_widths=())
     monkeypatch.setattr(identify, "DEFAULTS", hasty)
     found = identify_chain(period, ChainModel(setup.base), setup.prior)
@@ -142,7 +142,7 @@ def test_a_bound_counts_whatever_misfit_it_causes(misfit: float) -> None:
 
 @pytest.mark.parametrize("taken", [1.02, pytest.param(1.2, marks=pytest.mark.slow)])
 def test_friction_that_would_have_to_be_negative_is_at_its_bound(setup: bench.Setup, taken: float) -> None:
-    period = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101))
+    period = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101, 5.0))
     velocity = np.gradient(period.position[0], 1.0 / period.rate)
     torque = period.torque.copy()
     torque[0] -= taken * setup.arm.drives[0].viscous * velocity

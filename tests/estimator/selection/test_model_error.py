@@ -27,19 +27,18 @@ PEAK = (0.2,)
 WIDE_PEAK = (0.3,)
 
 
-@pytest.fixture(scope="module")
-def cogging_period(pendulum: Arm, recorded: Recorder, wave: Wave) -> SettledPeriod:
+def cogging(pendulum: Arm, recorded: Recorder, wave: Wave, seconds: float) -> SettledPeriod:
     """The motion of a pendulum whose cogging is 1.4 % of its gravity torque.
 
     It is found in each of seven multisines with this peak. With 0.2 N m, the motion covers too few of its
     cycles: in every other multisine, other terms take its place.
     """
     drive = pendulum.drives[0].model_copy(update={"cogging": 0.002, "cogging_cycles": 4.0})
-    return recorded(pendulum.model_copy(update={"drives": (drive,)}), wave(1, WIDE_PEAK))
+    return recorded(pendulum.model_copy(update={"drives": (drive,)}), wave(1, WIDE_PEAK, seconds))
 
 
-def test_cogging_is_found_and_named(pendulum: Arm, cogging_period: SettledPeriod) -> None:
-    choice = choose([cogging_period], None, "delay")
+def test_cogging_is_found_and_named(pendulum: Arm, recorded: Recorder, wave: Wave) -> None:
+    choice = choose([cogging(pendulum, recorded, wave, 10.0)], None, "delay")
     found = choice.estimate.parameters
     assert choice.estimate.model.options == {"cogging"}
     assert np.hypot(found["cogging_sin_1"], found["cogging_cos_1"]) == pytest.approx(0.002, rel=0.02)
@@ -49,13 +48,16 @@ def test_cogging_is_found_and_named(pendulum: Arm, cogging_period: SettledPeriod
             assert found[name] == pytest.approx(true, rel=0.005), name
 
 
-def test_a_model_error_does_not_overrule_what_is_known_of_encoders(cogging_period: SettledPeriod) -> None:
+def test_a_model_error_does_not_overrule_what_is_known_of_encoders(
+    pendulum: Arm, recorded: Recorder, wave: Wave
+) -> None:
+    period = cogging(pendulum, recorded, wave, 5.0)
     model = Model(1, "coulomb", "delay", {"encoder", "cable"})
     started = LikelihoodOptions(initial_widths=(0.05,), initial_bends=(5e-3,))  # the width is that of the arm
-    found = identify(cogging_period, model, options=started)
+    found = identify(period, model, options=started)
     # As if the residual's errors were independent.
     near = Near(found.parameters, found.start)
-    overruled = identify(cogging_period, model, near=near, options=LikelihoodOptions(least_inflation=np.inf))
+    overruled = identify(period, model, near=near, options=LikelihoodOptions(least_inflation=np.inf))
     assert size(found) < 0.8 * size(overruled)
 
 
@@ -77,7 +79,7 @@ def size(estimate: Estimate) -> float:
 
 def test_a_narrow_step_is_found_behind_a_stribeck_rise(recorded: Recorder, wave: Wave) -> None:
     arm = servo_arm({}, joints=1)
-    period = recorded(arm, wave(1, PEAK))
+    period = recorded(arm, wave(1, PEAK, 5.0))
     model = Model(1, "stribeck", "delay")
     disguise = {"coulomb_width": 0.12, "stribeck_rise": 3.0, "stribeck_velocity": 0.09}
     start = base_parameters(arm) | {f"{name}_{joint}": v for name, v in disguise.items() for joint in (1,)}

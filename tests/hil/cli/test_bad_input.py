@@ -1,11 +1,12 @@
 """Bad inputs over all commands: the right exit code, one message that names it, no traceback, nothing lost."""
 
-import hashlib
 import json
 import os
 import shutil
 import signal
+import stat
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -87,7 +88,7 @@ FILES: dict[str, bytes] = {
     "result.json": b"{}",
 }
 
-# command line, exit code, part of the message; there is a run folder `run`, and broken copies of it (see `folder`).
+# command line, exit code, part of the message; there is a run folder `run`, and broken copies of it (see `make`).
 CASES: list[tuple[str, int, str]] = [
     # configuration files, by every command that takes one
     *((f"{command} nowhere.toml", 2, "nowhere.toml") for command in ("identify", "record", "check", "dry-run")),
@@ -310,10 +311,8 @@ CASES: list[tuple[str, int, str]] = [
 ]
 
 
-@pytest.fixture
-def folder(tmp_path: Path, identified_once: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The files above, a run folder and broken copies of it (made of links, except for the broken part)."""
-    here = tmp_path / "here"
+def make(here: Path, identified: Path) -> None:
+    """The files above, a run folder and broken copies of it."""
     here.mkdir()
     for name, content in FILES.items():
         (here / name).write_bytes(content)
@@ -329,23 +328,48 @@ def folder(tmp_path: Path, identified_once: Path, monkeypatch: pytest.MonkeyPatc
     }
     for name, changed in broken.items():
         (here / name).mkdir()
-        for path in identified_once.iterdir():
+        for path in identified.iterdir():
             if path.is_file() and path.name not in changed:
                 shutil.copy(path, here / name / path.name)
         for file, content in changed.items():
             if content is not None:
                 (here / name / file).write_bytes(content)
     (here / "nothing").mkdir()
+
+
+@pytest.fixture(scope="module")
+def parent(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("parent")
+
+
+@pytest.fixture
+def folder(parent: Path, identified_once: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """What `make` makes, once for all tests, since it takes as long as most of them; what one of them adds is removed,
+    and if one changes something it is made again.
+    """
+    here = parent / "here"
+    if not here.exists():
+        make(here, identified_once)
     monkeypatch.chdir(here)
     monkeypatch.setattr(sys, "argv", sys.argv)
-    return here
+    before, there = contents(here), set(here.rglob("*"))
+    yield here
+    monkeypatch.chdir(parent)
+    for path in set(here.rglob("*")) - there:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+    if contents(here) != before:
+        shutil.rmtree(here)
 
 
-def contents(folder: Path) -> dict[str, str]:
+def contents(folder: Path) -> dict[str, tuple[int, ...]]:
+    """All files with what changes if anything is written to them: a time that no program can set, and the size."""
     return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        str(path.relative_to(folder)): (status.st_ino, status.st_size, status.st_ctime_ns)
         for path in sorted(folder.rglob("*"))
-        if path.is_file()
+        if stat.S_ISREG((status := path.stat()).st_mode)
     }
 
 

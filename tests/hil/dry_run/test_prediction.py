@@ -92,7 +92,7 @@ def test_a_horizontal_arm_is_foreseen_to_wander_and_a_stabiliser_to_hold_it(arm_
     for name, each in (("free", before + "[model]" + held.partition("[model]")[2]), ("held", text)):
         path.write_text(each, encoding="utf-8")
         config = load_config(path)
-        plan, ensemble = make_plan(config), prior_ensemble(config, 48)
+        plan, ensemble = make_plan(config), prior_ensemble(config, 24)
         assert all(physics.vector[[4, 5]].tolist() == [0.0, 0.0] for physics in ensemble.physics), "nothing weighs"
         foreseen = predict(config, plan, ensemble)
         widths[name] = foreseen.quantile[1] - foreseen.quantile[0]

@@ -14,7 +14,7 @@ from hil.errors import RunFolderError
 from hil.estimator.baselines import compare as peers
 from hil.runs.recording import load_samples
 from tests.support.command_line import hil
-from tests.support.edits import QUICK
+from tests.support.edits import WITHOUT_HELD_OUT
 from tests.support.paths import CONFIGS, DATA, ROOT
 
 ArmFile = Callable[..., Path]
@@ -215,14 +215,14 @@ def test_a_known_mass_mends_a_torque_constant(arm_file: ArmFile, capsys: pytest.
     """The torque constant in the TOML is 20 % too high for the shoulder and 10 % too low for the elbow."""
     wrong = [("torque_constant = 1.80         #", "torque_constant = 2.16         #")]
     wrong += [("torque_constant = 1.80\ntorque_constant_std", "torque_constant = 1.62\ntorque_constant_std")]
-    wrong += QUICK
-    assert hil("identify", arm_file(*wrong), "--out", "bare", "--json") == 0
+    wrong += WITHOUT_HELD_OUT
+    assert hil("record", arm_file(*wrong), "--out", "bare") == 0
     # 0.1 kg at 0.16 m on link 2 (0.2 kg, centre 0.112 m).
     mass, centre = 0.3, (0.2 * 0.112 + 0.1 * 0.16) / 0.3
     inertia = 2.9e-4 + 0.2 * (0.112 - centre) ** 2 + 0.1 * (0.16 - centre) ** 2
     link = f"length = 0.180\nmass = {mass}\ncentre = {centre!r}\ninertia = {inertia!r}"
     bare = "length = 0.180\nmass = 0.200\ncentre = 0.112\ninertia = 2.9e-4"
-    assert hil("identify", arm_file(*wrong, (bare, link)), "--out", "with_mass", "--json") == 0
+    assert hil("record", arm_file(*wrong, (bare, link)), "--out", "with_mass") == 0
     capsys.readouterr()
     asked = ("calibrate", "bare", "with_mass", "--mass", "0.1", "--distance", "0.16", "--length", "0.147")
     assert hil(*asked, "--json") == 0

@@ -23,11 +23,11 @@ RATE, SECONDS, PARTS = 100.0, 8.0, 20
 MIDDLE = 0.5 * SECONDS
 
 
-def pendulum(change: str = "", size: float = 1.0, seed: int = 2) -> Recording:
+def pendulum(change: str = "", size: float = 1.0, seed: int = 2, seconds: float = SECONDS) -> Recording:
     """A hanging joint, simulated here. change: what is `size` times its value in the second half; for `torque`, what
     becomes it in the course of the recording, while the column stays the same.
     """
-    time = np.arange(round(RATE * SECONDS)) / RATE
+    time = np.arange(round(RATE * seconds)) / RATE
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * math.pi, 12)
     torque = 0.08 * np.sin(2.0 * math.pi * np.outer(time, 0.25 + 0.21 * np.arange(12)) + phases).sum(axis=1)
     angle, q, v, h = np.empty(time.size), -0.5 * math.pi, 0.0, 1.0 / (PARTS * RATE)
@@ -75,8 +75,8 @@ def test_a_change_in_the_course_of_a_recording_is_named(change: str, size: float
 
 
 def test_a_torque_column_in_another_scale_than_that_of_the_other_file_is_named() -> None:
-    other = pendulum(seed=3)
-    found = named([pendulum(), replace(other, torque=1.25 * other.torque)], Model(1, "coulomb"))
+    first, other = (pendulum(seed=seed, seconds=5.0) for seed in (2, 3))
+    found = named([first, replace(other, torque=1.25 * other.torque)], Model(1, "coulomb"))
     assert found.startswith("The motor torque of joint 1 seems to be 0.8") and "in b.csv" in found
 
 

@@ -28,6 +28,7 @@ from hil.plan.plan import Plan, make_plan
 from hil.runs.recording import Phase, load_samples, sample_type
 from hil.runs.run_folder import RunFolder
 from hil.setup.session import servo_session
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 from tests.support.spied_plant import SpiedPlant, Spy, call_at
 
@@ -41,11 +42,25 @@ def swing_elbow(ports: list[Any], velocity: float) -> None:
     plant._state = (*plant._state[:3], velocity, *plant._state[4:])
 
 
+SHORTER = (
+    ("period = 2.0 ", "period = 1.0 "),
+    ("band = [0.5, 6.0]", "band = [1.0, 6.0]"),
+    ("ramp = 1.0 ", "ramp = 0.5 "),
+)
+"""Half a run, because its time is proportional to its samples."""
+
+
+@pytest.fixture
+def arm(arm: Arm) -> Arm:
+    return lambda *changes, **options: arm(*SHORTER, *changes, **options)
+
+
 @pytest.fixture(scope="module")
 def plan() -> Plan:
     """The plan of every run here, shared because designing it takes longer than playing it."""
     text = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
     text = text.replace("period = 10.0 ", "period = 2.0 ").replace("band = [0.1, 5.0]", "band = [0.5, 6.0]")
+    text = replaced(text, *SHORTER)
     return make_plan(parse_config(text, CONFIGS)).first_segment()
 
 
@@ -58,7 +73,7 @@ def run_until_stopped(
     return stop.value, load_samples(run.samples_path, 2)
 
 
-def once(action: Callable[[], Any], phase: Phase = Phase.PERIODIC, after: int = 800) -> Callable[[Progress], None]:
+def once(action: Callable[[], Any], phase: Phase = Phase.PERIODIC, after: int = 500) -> Callable[[Progress], None]:
     done: list[bool] = []
 
     def act(progress: Progress) -> None:
@@ -450,7 +465,7 @@ def test_a_joint_that_is_elsewhere_than_a_period_before_is_said_so(
 
     plan = replace(plan, periods=3)
     run = RunFolder.create(tmp_path / "run", config := arm())
-    late = once(push, after=200 + 120 + 4 * 800 + 100)
+    late = once(push, after=200 + 200 + 4 * 400 + 100)
     with pytest.raises(SafetyStop, match=r"does not repeat its motion: under the same torque") as stop:
         run_experiment(config, run, config.path, late, plan)
     assert stop.value.cause is Cause.UNLIKE_BEFORE

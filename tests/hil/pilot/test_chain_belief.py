@@ -1,5 +1,6 @@
 """The ensemble of a spatial arm's pilot remains an ensemble of arms when it learns from a recording."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 from hil.config.schema import Config, load_config
 from hil.dry_run.chain_prediction import loop_of
+from hil.estimator.chain.excitation import path_design
 from hil.estimator.chain.simulation.rollout import inertias, roll_out, weights
 from hil.pilot.chain_belief import SIMULATED, ChainBelief, _poses
 from hil.pilot.chain_paths import Paths, chain_config
@@ -28,6 +30,14 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Config:
     text = replaced(text, ("period = 10.0", "period = 5.0"), ("rate = 400.0", "rate = 100.0"))
     (folder / "leg.toml").write_text(text, encoding="utf-8")
     return chain_config(load_config(folder / "leg.toml"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _designed_quickly() -> Iterator[None]:
+    """A third of the design's generations is enough to find a usable path."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(path_design, "GENERATIONS", 20)
+        yield
 
 
 @pytest.fixture(scope="module")

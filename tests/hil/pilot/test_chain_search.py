@@ -19,6 +19,7 @@ from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_summary import chain_dry_run_json, chain_dry_run_lines, unsafe
 from hil.errors import Cause, ConfigError, DidNotMove, NoSafeTorque, NotSettled, SafetyStop
+from hil.estimator.chain.excitation import path_design
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.estimator.chain.excitation.path_design import Design
 from hil.pilot import chain_search, chain_shares
@@ -38,11 +39,15 @@ TEXT = replaced(LEG.read_text(encoding="utf-8"), ("period = 10.0", "period = 5.0
 """A shorter experiment, so that designs and simulations take less time."""
 
 DESIGNED: dict[bytes, Paths] = {}
+GENERATIONS = path_design.GENERATIONS
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _designed_once() -> Iterator[None]:
-    """Most tests use the same immutable paths, and a design takes as long as most of these tests without it."""
+    """Most tests use the same immutable paths, and a design takes as long as most of these tests without it.
+
+    A third of the design's generations is enough to find a usable path.
+    """
     of = Paths.of
 
     def remembered(config: Config, thought: Any, reserve: Reserve = RESERVE, tell: Any = None) -> Paths:
@@ -53,6 +58,7 @@ def _designed_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Paths, "of", remembered)
+        patch.setattr(path_design, "GENERATIONS", 20)
         yield
 
 
@@ -103,7 +109,8 @@ def test_all_of_it_stays_within_limits_and_ends_at_rest(found: hil.Identificatio
         assert np.abs(position[-1] - np.array(config.arm.rest_pose)).max() < 0.06
 
 
-def test_optimised_paths_are_twice_as_certain_as_random_ones() -> None:
+def test_optimised_paths_are_twice_as_certain_as_random_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(path_design, "GENERATIONS", GENERATIONS)
     config = chain_config(leg(("rate = 100.0", "rate = 400.0")))  # velocities are compared with finite differences
     paths = Paths.of(config, ChainBelief.prior(config).torque)
     plain = [paths.designer.plain(paths.identify.centre, seed).worst for seed in range(5)]

@@ -25,8 +25,8 @@ def test_an_arm_that_is_given_its_torque_is_judged(tmp_path: Path) -> None:
     given = (
         ("pilot = true", "peak_torque = [0.15]\nheld_out = false"),
         ("rate = 400.0", "rate = 200.0"),
-        ("period = 10.0", "period = 5.0"),
-        ("band = [0.1,", "band = [0.2,"),
+        ("period = 10.0", "period = 4.0"),
+        ("band = [0.1,", "band = [0.25,"),
         ('friction = "auto"', 'friction = "stribeck"'),
     )
     outcome = outcome_of(seed, replace(arm, toml=replaced(arm.toml, *given)), tmp_path)

@@ -43,7 +43,7 @@ def written(folder: Path, kind: tuple[float, float], joints: int = 1, swing: flo
     )
     path = folder / "arm.toml"
     text = arm_toml(ArmAnswers("fake://arm.toml", 1_000_000, each, gravity, "# Test."))
-    shorter = ("period = 10.0 ", "period = 4.0 "), ("band = [0.1, 5.0]", "band = [0.25, 5.0]")
+    shorter = ("period = 10.0 ", "period = 2.5 "), ("band = [0.1, 5.0]", "band = [0.4, 5.0]")
     text = replaced(text, ("rate = 400.0 ", "rate = 200.0 "), *shorter)
     path.write_text(text, encoding="utf-8")
     return path

@@ -13,7 +13,7 @@ from hil.experiment.run import run_experiment
 from hil.runs.recording import sample_type
 from hil.runs.run_folder import RunFolder
 from tests.hil.test_pwm import by_voltage as driven_by_voltage
-from tests.support.edits import FEWER_SAMPLES, replaced
+from tests.support.edits import WITHOUT_HELD_OUT, replaced
 from tests.support.paths import CONFIGS
 
 COUNT = 8000
@@ -94,7 +94,7 @@ def left_with_and_without(
 ) -> tuple[float, float]:
     """The residual beyond noise with and without the correction [encoder steps]."""
     path = driven_by_voltage(arm_file)
-    text = replaced(path.read_text(encoding="utf-8"), *FEWER_SAMPLES)
+    text = replaced(path.read_text(encoding="utf-8"), *WITHOUT_HELD_OUT)
     path.write_text(f"{text}\n[fake.supply]\nresistance_ohm = {ohm}\n", encoding="utf-8")
     config = load_config(path)
     run = RunFolder.create(tmp_path / f"run-{ohm:g}", config)

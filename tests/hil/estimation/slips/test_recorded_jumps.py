@@ -22,8 +22,17 @@ def recorded(seed: int, rate: float, disturb: Callable[[np.ndarray, np.ndarray],
     return Recording(time, np.ones((1, time.size)), position[None], np.array([STEP]), between="held")
 
 
-@pytest.mark.parametrize("lost", [False, True])
-@pytest.mark.parametrize("rate", [100.0, 250.0, 500.0])
+@pytest.mark.parametrize(
+    ("rate", "lost"),
+    [
+        (100.0, False),
+        (100.0, True),
+        (250.0, True),
+        (500.0, False),
+        pytest.param(250.0, False, marks=pytest.mark.slow),
+        pytest.param(500.0, True, marks=pytest.mark.slow),
+    ],
+)
 def test_a_jump_is_found_with_its_time_and_size(rate: float, lost: bool) -> None:
     found = 0
     for seed in range(10):
