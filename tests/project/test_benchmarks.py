@@ -1,17 +1,9 @@
 """All benchmark scripts start: their --help imports everything they use."""
 
-import io
-import runpy
-import sys
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import redirect_stderr, redirect_stdout
-from multiprocessing import get_context
-from pathlib import Path
-
 import pytest
 
 from tests.support.paths import ROOT
+from tests.support.processes import forked
 
 BENCHMARKS = ROOT / "benchmarks"
 NEEDS_A_CLIENT = "client_calls"
@@ -20,36 +12,10 @@ SCRIPTS = sorted(
     for path in BENCHMARKS.rglob("*.py")
     if "__main__" in path.read_text(encoding="utf-8") and path.stem != NEEDS_A_CLIENT
 )
-LIBRARIES = ["numpy", "scipy.optimize", "scipy.stats", "scipy.signal", "numba", "pydantic", "serial", "rich", "typer"]
-
-
-@pytest.fixture(scope="module")
-def processes() -> Iterator[ProcessPoolExecutor]:
-    """A fresh process for each script, forked from one that has only loaded the slow libraries."""
-    context = get_context("forkserver")
-    context.set_forkserver_preload(LIBRARIES)
-    with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
-        yield pool
-
-
-def said_by(script: Path) -> tuple[object, str, str]:
-    """Exit code and both outputs of a script run with --help, as by `python script --help`."""
-    own = {name for name in sys.modules if name.split(".")[0] in {"hil", "benchmarks"}}
-    assert not own, f"loaded before the script: {sorted(own)}"
-    sys.argv = [str(script), "--help"]
-    sys.path[0] = str(script.parent)
-    out, err = io.StringIO(), io.StringIO()
-    code: object = 0
-    with redirect_stdout(out), redirect_stderr(err):
-        try:
-            runpy.run_path(str(script), run_name="__main__")
-        except SystemExit as ended:
-            code = ended.code or 0
-    return code, out.getvalue(), err.getvalue()
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_a_benchmark_starts(name: str, processes: ProcessPoolExecutor) -> None:
-    code, out, err = processes.submit(said_by, BENCHMARKS / name).result()
-    assert code == 0, err[-500:]
-    assert "--json" in out
+def test_a_benchmark_starts(name: str) -> None:
+    done = forked.run([str(BENCHMARKS / name), "--help"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-500:]
+    assert "--json" in done.stdout
