@@ -91,13 +91,15 @@ class Motor:
         )
         """Torque constant [N m/A], offset and Coulomb level [N m], Stribeck rise [1], 1 / Stribeck velocity [s/rad]."""
         self.viscous = drive.viscous * viscous
-        self.plain = (*self.constants, self.viscous, self._lag)
-        """`constants`, viscous friction [N m s/rad] and current lag [s]: all parameters that a plain drive needs."""
+        self.plain = (*self.constants, self.viscous, self._lag, self._width)
+        """`constants`, viscous friction [N m s/rad], current lag [s] and width of smooth friction [rad/s]: all
+        parameters that a plain drive needs.
+        """
 
     @property
     def is_plain(self) -> bool:
-        """Whether the drive has only lag, torque, offset and Stribeck friction with stiction."""
-        return not (self._shaped or self._width or self.bristle_stiffness or self.jammed or self.held_at is not None)
+        """Whether the drive has only lag, torque, offset and Stribeck friction, with stiction or smooth."""
+        return not (self._shaped or self.bristle_stiffness or self.jammed or self.held_at is not None)
 
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
         """Return the effect of the drive over a step of `step` [s], given angle and velocity at its middle.

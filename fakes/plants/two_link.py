@@ -22,7 +22,7 @@ the results are bitwise identical. Otherwise, the loop is interpreted.
 import sys
 from collections.abc import Callable, Sequence
 from functools import cache
-from math import ceil, cos, exp, expm1, sin
+from math import ceil, cos, exp, expm1, sin, tanh
 from typing import Any
 
 from hil.fakes.plants.arm import Arm, Link, armature
@@ -104,7 +104,7 @@ class TwoLink:
         self._state = run(remaining, longest, command_1, command_2, self._state, self._terms, self._drives, motors)
 
 
-def _run(  # noqa: PLR0915
+def _run(  # noqa: PLR0912, PLR0915
     remaining: float,
     longest: float,
     i1: float,
@@ -122,8 +122,8 @@ def _run(  # noqa: PLR0915
     arm: `TwoLink._terms`. drives: `Motor.plain` of both motors. motors: None if both are plain, the only compiled case.
     """
     swing, inertia_second, turned_first, turned_second, weight_first, weight_second = arm
-    kt_1, offset_1, coulomb_1, rise_1, per_v1, viscous_1, lag_1 = drives[:7]
-    kt_2, offset_2, coulomb_2, rise_2, per_v2, viscous_2, lag_2 = drives[7:]
+    kt_1, offset_1, coulomb_1, rise_1, per_v1, viscous_1, lag_1, width_1 = drives[:8]
+    kt_2, offset_2, coulomb_2, rise_2, per_v2, viscous_2, lag_2, width_2 = drives[8:]
     q1, q2, v1, v2, a1, a2, amp_1, amp_2 = state
     if motors is not None:
         motors[0].current, motors[1].current = amp_1, amp_2
@@ -148,6 +148,16 @@ def _run(  # noqa: PLR0915
             level_1 = coulomb_1 + rise_1 * exp(-ratio_1 * ratio_1)
             level_2 = coulomb_2 + rise_2 * exp(-ratio_2 * ratio_2)
             next_amp_1, next_amp_2 = i1 + away_1 * left_1, i2 + away_2 * left_2
+            if width_1:
+                bend = tanh(middle_v1 / width_1)
+                push_1 -= level_1 * bend
+                slope_1 = level_1 / width_1 * (1.0 - bend * bend)
+                level_1 = 0.0
+            if width_2:
+                bend = tanh(middle_v2 / width_2)
+                push_2 -= level_2 * bend
+                slope_2 = level_2 / width_2 * (1.0 - bend * bend)
+                level_2 = 0.0
         else:
             push_1, level_1, slope_1, next_amp_1 = motors[0].push(step, i1, middle_q1, middle_v1)
             push_2, level_2, slope_2, next_amp_2 = motors[1].push(step, i2, middle_q2, middle_v2)

@@ -3,7 +3,6 @@
 Each client is run with everything it supports; known client bugs are named and left out.
 """
 
-import os
 import select
 import signal
 import subprocess
@@ -19,6 +18,7 @@ import pytest
 
 from benchmarks.bus import clients
 from tests.support.paths import ROOT
+from tests.support.processes import forked
 
 CONFIG = ROOT / "configs" / "fake_two_link.toml"
 WHY = 'needs the extra "clients": pip install hil[clients]'
@@ -28,9 +28,8 @@ WHY = 'needs the extra "clients": pip install hil[clients]'
 def device(tmp_path: Path) -> Iterator[str]:
     """Return the path of a terminal on which `hil fake` serves two XM430-W350 with IDs 1 and 2 at 1 MBd."""
     link = tmp_path / "arm"
-    command = [sys.executable, "-m", "hil", "fake", str(CONFIG), "--pty", "--link", str(link), "--quiet"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT, env=environment) as process:
+    command = ["hil", "fake", str(CONFIG), "--pty", "--link", str(link), "--quiet"]
+    with forked.start(command, stdout=subprocess.PIPE, cwd=ROOT) as process:
         try:
             assert process.stdout is not None
             ready, _, _ = select.select([process.stdout], [], [], 30.0)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import pytest
 import serial
@@ -19,6 +20,7 @@ from hil.fakes.description import load_fake
 from hil.fakes.pty_server import LinkError, PtyServer
 from tests.support.command_line import hil
 from tests.support.paths import ROOT
+from tests.support.processes import forked
 
 CONFIG = ROOT / "configs" / "fake_two_link.toml"
 PING = encode(1, Instruction.PING)
@@ -197,10 +199,13 @@ def test_wrong_input_is_one_message(capsys: pytest.CaptureFixture[str], argument
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_it_serves_until_a_signal_and_leaves_nothing(tmp_path: Path, number: signal.Signals) -> None:
     link = tmp_path / "arm"
-    command = [sys.executable, "-m", "hil", "fake", str(CONFIG), "--pty", "--link", str(link)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT, env=environment
+    command = ["hil", "fake", str(CONFIG), "--pty", "--link", str(link)]
+    options: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "cwd": ROOT}
+    options["env"] = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with (
+        subprocess.Popen([sys.executable, "-m", *command], **options)
+        if number == signal.SIGINT
+        else forked.start(command, **options)
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline().decode().strip() == str(link)

@@ -4,14 +4,13 @@ import ast
 import os
 import re
 import shutil
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from tests.support.paths import ROOT
+from tests.support.processes import forked
 
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 FOLDERS = ("drivers", "estimator", "fakes")
@@ -115,19 +114,22 @@ def follow(copy: Path, title: str) -> set[str]:
     return touched
 
 
+FORGET = """
+import sys
+for name in [name for name in sys.modules if name.split(".")[0] == "hil"]:
+    del sys.modules[name]
+from numba.core.config import reload_config
+reload_config()
+"""
+"""Code that forgets what the process has of hil, but not the libraries, and reads numba's variables again."""
+
+
 def run(copy: Path, code: str, **options: str) -> None:
-    """Run `code` in a fresh interpreter that imports the copy. options: further environment variables."""
-    environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", **options}
-    code = f"import hil; assert hil.__file__.startswith({str(copy)!r}), hil.__file__\n{code}"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=copy,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    """Run `code` in a process that imports the copy. options: further environment variables."""
+    environment = {**os.environ, "PYTHONPATH": str(copy), **options}
+    code = f"{FORGET}import hil; assert hil.__file__.startswith({str(copy)!r}), hil.__file__\n{code}"
+    words = [forked.CODE, code]
+    done = forked.run(words, cwd=copy, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -15,6 +15,7 @@ import pytest
 from hil.cli.app import COMMANDS, main
 from tests.support.edits import replaced
 from tests.support.paths import ROOT
+from tests.support.processes import forked
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 RUN_HERE = [path for path in DOCUMENTS if path.name != "first_evening.md"]
@@ -140,15 +141,14 @@ def test_commands_run(document: Path, place: Path, capsys: pytest.CaptureFixture
 
 
 def serve(words: list[str]) -> None:
-    """A command that runs until stopped must still be running after a moment, and end on request."""
-    with subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
-        try:
-            process.wait(timeout=2)
-        except subprocess.TimeoutExpired:
-            process.terminate()
-            return
+    """A command that runs until stopped must say where it serves, and end on request; another one ends by itself."""
+    with forked.start(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         assert process.stdout is not None
-        assert process.returncode == 0, process.stdout.read()
+        said = process.stdout.readline() if "--pty" in words else ""
+        if said.startswith("/"):
+            process.terminate()
+        said += process.stdout.read()
+        assert process.wait(60) == 0, said
 
 
 def test_make_targets_exist() -> None:

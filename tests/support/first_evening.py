@@ -18,10 +18,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tests.support.paths import ROOT
+from tests.support.processes import forked
 
 PAGE = ROOT / "docs" / "first_evening.md"
 PORT_ON_THE_PAGE = "/dev/ttyUSB0"
@@ -61,7 +63,7 @@ class Person:
     Behind a URL the arm exists in virtual time and only while a command runs, so no hand can move it.
 
     rest: joint angles at which the arm hangs [rad]. lengths_mm: as measured with a ruler, by joint. swings_deg: how far
-    each joint may swing.
+    each joint may swing. forked: whether the commands are forked from a process that has imported their libraries.
     """
 
     folder: Path
@@ -69,17 +71,18 @@ class Person:
     rest: Sequence[float] = (-np.pi / 2, 0.0)
     lengths_mm: Sequence[str] = ("147", "180")
     swings_deg: Sequence[str] = ("120", "150")
+    forked: bool = False
     asked: list[str] = field(default_factory=list)
 
     def type(self, words: Sequence[str], patience_s: float = 900.0) -> Typed:
         """Type one command and answer its questions until it ends. Raises TimeoutError."""
         typed = [self.port if word == PORT_ON_THE_PAGE else word for word in words]
         began = time.monotonic()
-        with _terminal(typed, self.folder) as (process, terminal):
+        with _terminal(typed, self.folder, self.forked) as (process, terminal):
             text = self._attend(process, terminal, began + patience_s)
         return Typed(list(words), process.returncode, text, time.monotonic() - began)
 
-    def _attend(self, process: subprocess.Popen[bytes], terminal: int, deadline: float) -> str:
+    def _attend(self, process: Any, terminal: int, deadline: float) -> str:
         text, answered = "", 0
         while True:
             if time.monotonic() > deadline:
@@ -138,13 +141,14 @@ def fake_arm(config: Path, link: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 @contextlib.contextmanager
-def _terminal(words: Sequence[str], folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+def _terminal(words: Sequence[str], folder: Path, fork: bool) -> Iterator[tuple[Any, int]]:
     """Start `hil ...` on a new pseudo-terminal; yields the process and the terminal's other end."""
     ours, theirs = pty.openpty()
     try:
-        command = [sys.executable, "-m", *words]
-        process = subprocess.Popen(
-            command, stdin=theirs, stdout=theirs, stderr=theirs, cwd=folder, env=_environment(), start_new_session=True
+        options: Any = {"stdin": theirs, "stdout": theirs, "stderr": theirs, "cwd": folder, "env": _environment()}
+        options["start_new_session"] = True
+        process = (
+            forked.start(words, **options) if fork else subprocess.Popen([sys.executable, "-m", *words], **options)
         )
     finally:
         os.close(theirs)

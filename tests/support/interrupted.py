@@ -161,10 +161,18 @@ class Interrupted:
 
 
 def interrupt(stage: str, number: signal.Signals, words: list[str], folder: Path) -> Interrupted:
-    """Run a command in a process in `folder`, interrupt it, and run the command that it names then in this one."""
-    command = [sys.executable, "-m", "tests.support.interrupted", stage, number.name, *words]
-    done = subprocess.run(
-        command, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=600, check=False
+    """Run a command in a process in `folder`, interrupt it, and run the command that it names then in this one.
+
+    The process is a new interpreter for a Ctrl-C, which an interpreter handles itself, and a forked one otherwise.
+    """
+    from tests.support.processes import forked  # which a new interpreter does without
+
+    command = ["tests.support.interrupted", stage, number.name, *words]
+    options: Any = {"cwd": folder, "env": ENVIRONMENT, "capture_output": True, "text": True, "timeout": 600}
+    done = (
+        subprocess.run([sys.executable, "-m", *command], **options, check=False)
+        if number == signal.SIGINT
+        else forked.run(command, **options)
     )
     named = [line for line in done.stderr.splitlines() if line.startswith("Next: hil ")]
     following = shlex.split(named[-1].removeprefix("Next: ")) if named else []

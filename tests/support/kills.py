@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import sys
 import time
 import traceback
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from hil.experiment.run import run_experiment
 from hil.runs.run_folder import RunFolder
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS, ROOT
+from tests.support.processes import forked
 
 CONFIG = CONFIGS / "fake_two_link.toml"
 ASKED_AFTER_S = 0.105
@@ -83,11 +83,8 @@ def kill_campaign(kills: int, folder: Path, seed: int = 1, answered_before: floa
 @contextmanager
 def fake_arm(link: Path) -> Iterator[None]:
     """Serve a fake arm on a pty from another process."""
-    server = subprocess.Popen(
-        [sys.executable, "-m", "hil", "fake", str(CONFIG), "--pty", "--link", str(link), "--quiet"],
-        stdout=subprocess.PIPE,
-        cwd=ROOT,
-    )
+    words = ["hil", "fake", str(CONFIG), "--pty", "--link", str(link), "--quiet"]
+    server = forked.start(words, stdout=subprocess.PIPE, cwd=ROOT)
     try:
         assert server.stdout is not None
         server.stdout.readline()

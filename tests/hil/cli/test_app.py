@@ -20,6 +20,7 @@ from hil.runs.recording import load_samples
 from tests.support.command_line import hil
 from tests.support.edits import FEWER_SAMPLES, QUICK
 from tests.support.paths import CONFIGS
+from tests.support.processes import forked
 
 ArmFile = Callable[..., Path]
 
@@ -185,8 +186,8 @@ def test_a_killed_process_leaves_its_samples_on_file(arm_file: ArmFile, tmp_path
 
 def test_sigterm_ends_in_a_message_and_exit_code_143(arm_file: ArmFile, tmp_path: Path) -> None:
     path = arm_file(*LONG)
-    command = [sys.executable, "-m", "hil", "identify", str(path), "--out", "run"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+    command = ["hil", "identify", str(path), "--out", "run"]
+    with forked.start(command, stderr=subprocess.PIPE, text=True) as process:
         for _ in range(600):
             time.sleep(0.05)
             if (tmp_path / "run" / "events.jsonl").is_file() and "ramp in" in (

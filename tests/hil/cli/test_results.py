@@ -15,6 +15,7 @@ from hil.cli.views.result_table import print_result
 from hil.model_file import read_settled_result
 from hil.runs.run_folder import RunFolder
 from tests.support.command_line import hil
+from tests.support.processes import forked
 
 
 @pytest.fixture(autouse=True)
@@ -64,14 +65,15 @@ def test_arguments_that_do_not_go_together(identified: Path, capsys: pytest.Capt
 
 def test_a_reader_that_closes_early_and_a_full_disk_are_no_traceback(identified: Path) -> None:
     """As `hil runs | head -1` and `hil runs > /dev/full` do."""
-    command = [sys.executable, "-m", "hil", "diff", str(identified), str(identified)]
+    command = ["hil", "diff", str(identified), str(identified)]
     reading, writing = os.pipe()
     os.close(reading)
-    closed = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    real = [sys.executable, "-m", *command]
+    closed = subprocess.run(real, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writing)
     assert (closed.returncode, closed.stderr) == (0, "")
     with Path("/dev/full").open("w") as full_disk:
-        full = subprocess.run(command, stdout=full_disk, stderr=subprocess.PIPE, text=True, check=False)
+        full = forked.run(command, stdout=full_disk, stderr=subprocess.PIPE, text=True)
     assert full.returncode == 1 and "no space left" in full.stderr and "Traceback" not in full.stderr
 
 

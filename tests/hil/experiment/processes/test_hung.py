@@ -26,6 +26,7 @@ from hil.fakes.description import load_fake
 from hil.fakes.pty_server import PtyServer
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS, ROOT
+from tests.support.processes import forked
 
 CONFIG = CONFIGS / "fake_two_link.toml"
 RATE = 50
@@ -226,9 +227,12 @@ def _try(folder: Path, what: Hung, act: Callable[[int], None], releases: bool) -
     run = folder / "run"
     with served(folder / "arm") as servos:
         output = what(run)
-        command = [sys.executable, "-m", "hil", "record", str(write_config(folder)), "--out", str(run)]
-        process: Any = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=output.output, stderr=output.output, cwd=ROOT
+        command = ["hil", "record", str(write_config(folder)), "--out", str(run)]
+        streams: Any = {"stdin": subprocess.DEVNULL, "stdout": output.output, "stderr": output.output}
+        process: Any = (
+            subprocess.Popen([sys.executable, "-m", *command], **streams, cwd=ROOT)
+            if what is Terminal
+            else forked.start(command, **streams, cwd=ROOT)
         )
         try:
             moving = until(lambda: process.poll() is not None or any("ramp in" in each for each in events(run)))

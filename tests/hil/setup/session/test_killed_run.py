@@ -3,7 +3,6 @@
 import os
 import shutil
 import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,6 +23,7 @@ from hil.setup.session.servo_session import servo_session
 from hil.setup.session.settings_file import settings_path
 from tests.support.bench import SHORT, Arm, Bench, play
 from tests.support.command_line import hil
+from tests.support.processes import forked
 
 
 def test_settings_that_a_killed_program_left_are_restored_up_to_a_limit_lowered_since(
@@ -227,11 +227,8 @@ def test_a_killed_process_on_a_pty_is_put_back(arm_file: Any, tmp_path: Path) ->
     """Two programs, a real SIGKILL between them, and the fake arm in a third process."""
     path = arm_file()
     link = tmp_path / "arm"
-    served = subprocess.Popen(
-        [sys.executable, "-m", "hil", "fake", str(path), "--pty", "--link", str(link), "--quiet"],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    words = ["hil", "fake", str(path), "--pty", "--link", str(link), "--quiet"]
+    served = forked.start(words, stdout=subprocess.PIPE, text=True)
     try:
         assert served.stdout is not None and served.stdout.readline()
         real = path.with_name("real.toml")
@@ -242,7 +239,7 @@ def test_a_killed_process_on_a_pty_is_put_back(arm_file: Any, tmp_path: Path) ->
             "from hil.setup.session.servo_session import servo_session\n"
             "with servo_session(load_config(Path(sys.argv[1]))): os.kill(os.getpid(), signal.SIGKILL)"
         )
-        killed = subprocess.run([sys.executable, "-c", code, str(real)], check=False, env=dict(os.environ))
+        killed = forked.run([forked.CODE, code, str(real)])
         assert killed.returncode == -9
         with ServoBus.connect(config.bus) as bus:
             assert [bus.servo(joint).read("Operating Mode") for joint in bus.joints] == [0, 0]

@@ -1,0 +1,1 @@
+"""Processes that start without the half second to a second that importing numpy, scipy, numba and hil takes."""
