@@ -145,7 +145,7 @@ def serve(words: list[str]) -> None:
     with forked.start(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         assert process.stdout is not None
         said = process.stdout.readline() if "--pty" in words else ""
-        if said.startswith("/"):
+        if said:
             process.terminate()
         said += process.stdout.read()
         assert process.wait(60) == 0, said
