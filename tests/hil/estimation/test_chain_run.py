@@ -50,7 +50,7 @@ TEXT = FOUR.read_text(encoding="utf-8")
 
 
 def short(folder: Path) -> Config:
-    """The configuration at a quarter of its rate, beside its URDF. Half its period leaves moment_z_2 uncertain."""
+    """The configuration at a quarter of its rate, next to its URDF. Half the period leaves moment_z_2 uncertain."""
     (folder / "open_manipulator_x_like.urdf").write_bytes((CONFIGS / "open_manipulator_x_like.urdf").read_bytes())
     text = replaced(TEXT, ("rate = 400.0", "rate = 100.0"))
     (folder / "arm.toml").write_text(text, encoding="utf-8")
