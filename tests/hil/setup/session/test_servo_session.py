@@ -368,6 +368,27 @@ def test_torque_that_another_program_keeps_switching_on_is_said_in_capitals(
     assert ("It swings." in said) is (stop is not None)
 
 
+def test_a_program_that_switches_torque_on_now_and_then_does_not_pass_for_one_that_has_stopped(
+    arm: Arm, bench: Bench
+) -> None:
+    """Every 30 ms, so that the reading after a cut finds torque off, whatever follows."""
+    config = arm(SHORT)
+    with pytest.raises(TorqueNotOff) as ended, servo_session(config), servo_session(config) as bus:
+        with bus.torque(config.safety.watchdog):
+            pass
+        servo, write, next_at = bench.servos[2], bench.port.write, bus.port.clock.now()
+
+        def watched(data: bytes) -> Any:
+            nonlocal next_at
+            if (now := bus.port.clock.now()) >= next_at:
+                next_at = now + 0.03
+                servo.write(64, b"\x01")
+            return write(data)
+
+        bench.port.write = watched
+    assert message(ended.value).startswith("hil: TORQUE IS ON AT JOINT 'ELBOW'")
+
+
 def test_torque_that_another_program_keeps_switching_on_before_a_run_is_not_said_to_be_off(
     arm: Arm, bench: Bench
 ) -> None:
