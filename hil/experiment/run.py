@@ -13,11 +13,12 @@ from hil.drivers.adapter.latency import WANTED_MS, command_to_set, latency_timer
 from hil.drivers.bus import ServoBus
 from hil.drivers.clock import Clock, WallClock
 from hil.drivers.errors import DriverError, PortLost, ServoFault, TorqueNotOff, WrongSetting
+from hil.drivers.servo import LATE
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
 from hil.estimator.chain.simulation.rollout import ChainArms
-from hil.experiment.guard import MOST_OUTSIDE_RAD, NONE_HEARD
+from hil.experiment.guard import LOST, MOST_OUTSIDE_RAD, NONE_HEARD
 from hil.experiment.model_watch import UNLIKE_ANY_ARM
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
@@ -184,8 +185,8 @@ def _play(
         note(f"stopped: {cause or 'end of the run.'} {about_torque(bus)}")
         if isinstance(error, TorqueNotOff):
             _try_again(bus, note)
-        if (who := _who_was_silent(bus, cause)) and isinstance(cause, SafetyStop):
-            cause.args = (str(cause).partition(NONE_HEARD)[0] + who,)
+        if isinstance(cause, SafetyStop) and (who := _who_was_silent(bus, cause) or _who_was_late(bus, cause)):
+            cause.args = (str(cause).partition(NONE_HEARD)[0].partition(LOST)[0] + who,)
             note(who)
         if isinstance(error, TorqueNotOff) and (instead := confirmed_later(bus, error)):
             if isinstance(instead, DriverError | HilError):
@@ -234,6 +235,12 @@ def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
         f"{' and '.join(map(str, silent))} did not: a silent servo hides the replies of those after it. Check its "
         "cable and its supply."
     )
+
+
+def _who_was_late(bus: ServoBus, stop: SafetyStop) -> str:
+    """If replies arrived only once torque was cut, say that they are late; the guard must not wait for them."""
+    is_late = bus.port.late_replies and not bus.port.strangers
+    return LATE if is_late and (NONE_HEARD in str(stop) or LOST in str(stop)) else ""
 
 
 def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> None:

@@ -240,6 +240,16 @@ def test_a_servo_that_answers_again_after_torque_off_is_off_and_put_back(
     assert "missed" in stopped and "replies in a row" in stopped, "the cause, not only that torque was left on"
 
 
+@pytest.mark.parametrize("seconds", [0.07, 0.15])
+def test_settings_are_restored_although_an_adapter_holds_back_all_replies_now_and_then(
+    arm: Arm, bench: Bench, seconds: float, state_folder: Path
+) -> None:
+    with servo_session(arm(SHORT)):
+        bus = bench.port.bus
+        bus.faults.add(Fault(kind="late_reply", at=bus.time, amount=seconds, probability=0.05))
+    assert bench.changed() == [] and not list(state_folder.glob("*.json"))
+
+
 @pytest.mark.parametrize("servo", [1, 2])
 def test_a_servo_that_rebooted_is_named_with_those_that_were_fine(
     arm: Arm, tmp_path: Path, bench: Bench, servo: int
