@@ -4,7 +4,7 @@ HilError                    exit code
 ├── ConfigError             2   the TOML is unreadable, or a key, value or combination in it is wrong
 ├── CsvError                2   a CSV file lacks columns or has fields that are not numbers
 ├── MissingExtra            2   an optional package is not installed
-├── RunFolderError          2   the run folder cannot be written, or holds no readable run
+├── RunFolderError          2   the run folder cannot be written, or holds no readable run (1 if it was lost in a run)
 ├── ResultError             2   result.json is missing, incomplete, damaged, or from a newer hil
 ├── ExportError             2   the format cannot hold this arm, or a package for it is not installed
 ├── SchedulerLost           1   a study's scheduler no longer responds

@@ -15,7 +15,7 @@ from hil.clearance.doubts import doubts
 from hil.config.schema import Config
 from hil.drivers.errors import DriverError
 from hil.dry_run.ensemble import earlier_result
-from hil.errors import ConfigError, ExperimentError, StopRequested
+from hil.errors import ConfigError, StopRequested
 from hil.estimation.after_a_stop import after_a_failure, after_a_stop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
@@ -145,7 +145,8 @@ def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: P
     if isinstance(stopped, KeyboardInterrupt | StopRequested):
         said = after_a_stop(run, command, shown)
     else:
-        said = after_a_failure(run, shown) if isinstance(stopped, ExperimentError | DriverError) else []
+        failed = isinstance(stopped, DriverError) or getattr(stopped, "exit_code", 0) == 1
+        said = after_a_failure(run, shown) if failed else []
     if said and _is_unsettled(stopped):
         said[-1] = next_step("check", shown)
     return said
