@@ -1,5 +1,6 @@
 """Run the experiment on the bus: open, check, switch torque on, stream, and always switch torque off."""
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -185,7 +186,7 @@ def _play(
         note(f"stopped: {cause or 'end of the run.'} {about_torque(bus)}")
         if isinstance(error, TorqueNotOff):
             _try_again(bus, note)
-        if isinstance(cause, SafetyStop) and (who := _who_was_silent(bus, cause) or _who_was_late(bus, cause)):
+        if isinstance(cause, SafetyStop) and (who := _why_silent(bus, cause)):
             cause.args = (str(cause).partition(NONE_HEARD)[0].partition(LOST)[0] + who,)
             note(who)
         if isinstance(error, TorqueNotOff) and (instead := confirmed_later(bus, error)):
@@ -221,11 +222,15 @@ def _try_again(bus: ServoBus, note: Note) -> None:
                 note(f"{drive.title} answers again; {bus.torque_off_report}")
 
 
-def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
-    """If no servo was heard, say which ones answered when torque was cut: a silent servo hides those after it."""
+def _why_silent(bus: ServoBus, stop: SafetyStop) -> str:
+    """Say that replies were late if they arrived once torque was cut. If no servo was heard, say which ones answered
+    then: a silent servo hides those after it.
+    """
     report = bus.torque_off_report
-    if not isinstance(stop, SafetyStop) or stop.cause is not Cause.MISSING or report is None:
+    if stop.cause is not Cause.MISSING or report is None:
         return ""
+    if bus.port.late_replies and not bus.port.strangers and re.search(f"{NONE_HEARD}|{LOST}", str(stop)):
+        return LATE
     silent = {joint for joint, _ in report.unconfirmed} | report.later | report.rebooted
     heard = [str(joint) for joint in bus.drives if joint not in silent]
     if NONE_HEARD not in str(stop) or not silent or not heard:
@@ -235,12 +240,6 @@ def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
         f"{' and '.join(map(str, silent))} did not: a silent servo hides the replies of those after it. Check its "
         "cable and its supply."
     )
-
-
-def _who_was_late(bus: ServoBus, stop: SafetyStop) -> str:
-    """If replies arrived only once torque was cut, say that they are late; the guard must not wait for them."""
-    is_late = bus.port.late_replies and not bus.port.strangers
-    return LATE if is_late and (NONE_HEARD in str(stop) or LOST in str(stop)) else ""
 
 
 def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> None:
