@@ -280,9 +280,8 @@ def is_torque_on(servo: Servo) -> bool | None:
 def has_torque(servo: Servo) -> bool | None:
     """Read whether a servo's torque is on; None if its answers may belong to other requests.
 
-    A reply does not identify its register, so Torque Enable is read twice, with another register in between. If the two
-    readings differ, another program may be switching torque on, so both are repeated. Raises the errors of
-    `Servo.read`.
+    A reply does not identify its register, so Torque Enable is read twice, with another register in between, and again
+    if another program has changed it meanwhile. Raises the errors of `Servo.read`.
     """
     for _ in range(_READINGS):
         first = servo.read_despite_error("Torque Enable")

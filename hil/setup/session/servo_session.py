@@ -49,9 +49,6 @@ SETTINGS_NAME = "servo_settings.json"
 _MOST_CUTS = 5
 """Largest number of times that torque is cut again at the end if another program switches it on."""
 
-_LOOK_S = 0.01
-"""Interval at which torque is then watched [s]."""
-
 REBOOT_S = 0.6
 """A servo that does not answer at the end may be booting; it is tried again after this time [s]."""
 
@@ -168,8 +165,7 @@ class ServoSession:
     def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
         """Cut torque where it is on and restore these servos' settings; return whether there was anything to do.
 
-        Where it has been switched on before, it is watched for a while: a program that does so again and again is named
-        as such, whatever the moment of the last reading.
+        If it has been switched on before, it is watched for WATCH_S: a single reading may come between two switches.
 
         failed: receives the errors of the servos whose settings could not be restored.
         """
@@ -182,7 +178,7 @@ class ServoSession:
             on = [joint for joint, is_on in self._torque.items() if is_on]
             if on or clock.now() >= until:
                 break
-            clock.wait_until(clock.now() + _LOOK_S)
+            clock.wait_until(clock.now() + WATCH_S / 10)
         if not on or max(self._on_again.get(joint, 0) for joint in on) >= _MOST_CUTS:
             return False
         self.bus.cut_foreign_torque(on)
