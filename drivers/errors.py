@@ -1,21 +1,4 @@
-"""Errors raised by the servo drivers.
-
-DriverError
-├── UnknownModel        no control table describes this model name or number
-├── PortNotOpened       the port does not exist, is in use, or does not support this baud rate
-│   └── NotPermitted    the port exists, but this user is not permitted to open it
-├── PortLost            the port failed while open: cable unplugged, adapter gone
-├── NoReply             a servo did not reply: wrong ID, wrong baud rate, no power
-├── WrongReply          a servo's reply is corrupted or does not match the request
-├── ServoRefused        a servo replied with an error code: access, range, limit
-├── ServoFault          a servo reports a hardware error: overload, overheating, voltage
-├── BusShared           another master is active on the same bus
-│   └── BusOverheard    its packets were heard; nothing shows that it has written anything
-├── WrongModel          a different model, or one whose firmware is too old, replies at this ID
-├── WrongSetting        a register holds a value that rules out an experiment
-│   └── TorqueHeld      torque is already on: another program holds or drives the arm
-└── TorqueNotOff        torque off could not be confirmed for a servo
-"""
+"""Errors raised by the servo drivers, all of them subclasses of DriverError; `hil.errors` gives their exit codes."""
 
 __all__ = [
     "BusOverheard",

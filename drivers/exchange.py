@@ -1,11 +1,8 @@
 """The control cycle on the wire: goals out and states in, with one write and one bounded read.
 
-Current mode and PWM mode have different goal registers. Each register has its own Sync Write, but all of these are sent
-in one write to the port.
-
-A Sync Write has no reply, so the group read that follows it can be sent in the same write, which takes one adapter
-transaction instead of two. All packets are prepared in advance; a cycle only packs the goals and computes one CRC
-per goal register.
+Goals in current mode and in PWM mode have registers, and so Sync Writes, of their own. A Sync Write has no reply, so
+all packets of a cycle can be sent in one write, which takes one adapter transaction instead of two. They are prepared
+in advance; a cycle only packs the goals and computes one CRC per register.
 
 The registers that are read vary from cycle to cycle. Most cycles read `spans[0]`. Every `slow_every`-th cycle reads one
 of the other spans, in turn; every `status_every`-th cycle reads `status`, the registers that show whether torque is

@@ -65,6 +65,9 @@ transmitted with this many bits per byte. The true number is ten.
 _BAUD_TOLERANCE = 0.03
 """Largest relative baud rate error at which bytes are still received."""
 
+GROWTH = 3
+"""Value of `Port.growth` without torque: an adapter may delay replies for longer than the first attempts take."""
+
 _WRITE_PATIENCE_S = 0.1
 """How long a device may refuse to accept bytes before it counts as lost [s]."""
 
@@ -145,6 +148,10 @@ class Port:
         """Bytes that `ask` found pending before a request and set aside: late replies, or replies to another master."""
         self.strangers = 0
         """Number of another master's instructions received during set-up work."""
+        self.late_replies = 0
+        """Number of late replies during set-up work since torque was last switched on."""
+        self.growth = GROWTH
+        """Factor by which set-up work waits longer for each further attempt; 1 while servos have torque."""
         self._serial = opened
         self._timeout: float | None = opened.timeout
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()

@@ -20,11 +20,7 @@ _LATE_SHARE = 0.25
 
 
 class ReadBackExchange(Exchange):
-    """An `Exchange` that reads back goals, settings or Torque Enable where a cycle leaves time for it.
-
-    A cycle overwrites another master's goals before it samples replies, so only a read right before the cycle shows who
-    commands the servos. There are no read-backs before `add_read_back`.
-    """
+    """An `Exchange` that also reads back goals, settings or Torque Enable once `add_read_back` has been called."""
 
     _read_back: ReadBack | None = None
     _overtime = 0.0
@@ -117,11 +113,9 @@ class ReadBackExchange(Exchange):
     def overruled(self, due: float) -> Overruled | None:
         """Read back goals, settings or Torque Enable if there is time before the next cycle, due at `due` [s].
 
-        The next cycle overwrites another master's goals before its own replies are sampled, so only what the servos
-        hold right before a cycle shows who commands them. Missing replies are ignored here; the next cycle detects
-        them.
+        Missing replies are ignored here; the next cycle detects them.
 
-        Returns a value that only another master can have written, or None. Raises PortLost.
+        Returns what only another master can have written, or None. Raises PortLost.
         """
         back = self._read_back
         if back is None or not self._sent:

@@ -8,8 +8,7 @@ from hil.drivers.packet import HEADER, MAX_LENGTH, NO_ID, Framer, Instruction, c
 from hil.drivers.port import Port
 
 PATIENCE_S = 0.018
-"""How long set-up work waits for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
-
+"""How long set-up work first waits for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
 
 _SHORTEST = 11
 """Number of bytes of a status packet without data."""
@@ -27,6 +26,8 @@ class SdkPort:
 
     def __init__(self, port: Port) -> None:
         self._port = port
+        self.patience = PATIENCE_S
+        """How long to wait beyond wire time [s]."""
         self._deadline = 0.0
         self._sent = b""
         """The last bytes written, kept as long as their echo may still arrive."""
@@ -52,9 +53,11 @@ class SdkPort:
             port.overheard = b""
 
     def hear(self, received: bytes) -> None:
-        """Count another master's instructions among bytes that belong to no reply."""
+        """Count late replies and another master's instructions among bytes that belong to no reply."""
         if received and not self._port.echoes:
-            self._port.strangers += sum(not packet.is_status for packet in Framer().feed(received))
+            for packet in Framer().feed(received):
+                self._port.late_replies += packet.is_status
+                self._port.strangers += not packet.is_status
 
     def writePort(self, packet: list[int]) -> int:  # noqa: N802
         self._sent, self._held = bytes(packet), b""
@@ -82,7 +85,7 @@ class SdkPort:
 
     def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
         # Twice the reply's wire time: once for the instruction before it, once for the reply.
-        self._set_timeout(2 * self._port.wire_time(packet_length) + max(PATIENCE_S, self._port.latency + 2e-3))
+        self._set_timeout(2 * self._port.wire_time(packet_length) + max(self.patience, self._port.latency + 2e-3))
 
     def setPacketTimeoutMillis(self, msec: float) -> None:  # noqa: N802
         self._set_timeout(msec / 1000)

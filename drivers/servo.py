@@ -14,7 +14,7 @@ from hil.drivers.control_table import ControlTable, Register
 from hil.drivers.errors import NoReply, ServoRefused, WrongReply
 from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError
 from hil.drivers.port import Port
-from hil.drivers.sdk_port import ResyncingPacketHandler, SdkPort
+from hil.drivers.sdk_port import PATIENCE_S, ResyncingPacketHandler, SdkPort
 
 _T = TypeVar("_T")
 
@@ -27,6 +27,11 @@ _LATE_S = 0.06
 
 _DATA = 9
 """Index of the first data byte in a status packet."""
+
+LATE = (
+    "Replies did arrive, but too late: check the adapter's latency timer, the USB hub and whether other programs keep "
+    "the computer busy."
+)
 
 NO_ERROR = "none"
 """Result of `describe_error` if there is no error."""
@@ -178,6 +183,7 @@ class Servo:
         late, others = False, set[int]()
         for left in reversed(range(attempts)):
             self._sdk.heard = -1
+            self._sdk_port.patience = PATIENCE_S * self.port.growth ** (attempts - 1 - left)
             value, result, error = action()
             others.add(self._sdk.heard)
             if result == COMM_SUCCESS and not (is_read and error & ~ALERT):
@@ -189,16 +195,17 @@ class Servo:
         if late and result == COMM_SUCCESS:
             # Late replies to the requests that timed out may still arrive and would be taken for the next reply.
             self.port.clock.wait_until(self.port.clock.now() + _LATE_S)
-            self.port.discard_input()
+            self._sdk_port.clearPort()
         if result == COMM_RX_TIMEOUT and len(others) == 1 and (other := others.pop()) not in (-1, self.id):
             raise NoReply(
                 f"Requests to {self.title} are answered by ID {other} ({what}): the servos' IDs or replies "
                 "are mixed up. Check that every servo has its own ID, and whether a device on the bus changes replies."
             )
         if result == COMM_RX_TIMEOUT:
+            check = f"{LATE} Otherwise, check" if self.port.late_replies else "Check"
             raise NoReply(
-                f"{self.title} does not answer at {self.port.baud} baud on {self.port.url} ({what}). Check its supply "
-                "and its cable; `hil scan` shows whether it has another ID or baud rate."
+                f"{self.title} does not answer at {self.port.baud} baud on {self.port.url} ({what}). {check} its "
+                "supply and its cable; `hil scan` shows whether it has another ID or baud rate."
             )
         if result != COMM_SUCCESS:
             text = self._sdk.getTxRxResult(result).removeprefix("[TxRxResult] ").rstrip("!. ").lower()

@@ -1,15 +1,4 @@
-"""The estimator's exceptions, as a tree.
-
-EstimationError
-├── ExcitationError       the requested multisine cannot be built
-├── RecordingError        the samples cannot be used
-│   ├── ShapeError        arrays with incompatible shapes
-│   └── StandstillError   a joint never moved
-├── ModelError            unsupported friction model, drive model or number of joints
-├── UnidentifiableError   the data do not separate some parameters
-├── ConvergenceError      no minimum of the likelihood was found
-└── PeriodicityError      the simulated arm does not settle into periodic motion
-"""
+"""The estimator's exceptions, all of them subclasses of EstimationError."""
 
 __all__ = [
     "ConvergenceError",

@@ -1,24 +1,24 @@
 """All exceptions of hil, as a tree, with their exit codes.
 
 HilError                    exit code
-├── ConfigError             2   the TOML is unreadable, or a key, value or combination in it is wrong
-├── CsvError                2   a CSV file lacks columns or has fields that are not numbers
-├── MissingExtra            2   an optional package is not installed
-├── RunFolderError          2   the run folder cannot be written, or holds no readable run
-├── ResultError             2   result.json is missing, incomplete, damaged, or from a newer hil
-├── ExportError             2   the format cannot hold this arm, or a package for it is not installed
-├── SchedulerLost           1   a study's scheduler no longer responds
-└── ExperimentError         1   the experiment could not be finished
-    ├── SafetyStop          1   the guard stopped the arm because a limit was exceeded
-    ├── StopRequested     130   Ctrl-C (143: SIGTERM, 129: SIGHUP)
-    ├── NotSettled          1   the motion never became periodic
-    ├── DidNotMove          1   a joint did not move, because of friction or an obstacle
-    ├── NoSafeTorque        1   a dry run found no torque that keeps the arm within its limits
-    └── RecordingCutShort   1   the recording holds no settled period
+├── ConfigError             2
+├── CsvError                2
+├── MissingExtra            2
+├── RunFolderError          2   1 if the folder was lost during the run
+├── ResultError             2
+├── ExportError             2
+├── SchedulerLost           1
+└── ExperimentError         1
+    ├── SafetyStop          1
+    ├── StopRequested     130   143: SIGTERM, 129: SIGHUP
+    ├── NotSettled          1
+    ├── DidNotMove          1
+    ├── NoSafeTorque        1
+    └── RecordingCutShort   1
 
-hil.drivers.errors.DriverError  1   communication with the servos; subclasses are listed there.
+hil.drivers.errors.DriverError  1   communication with the servos
                                 UnknownModel, PortNotOpened, WrongModel and WrongSetting exit with 2
-hil.estimator.errors.EstimationError  1   the recording does not determine the parameters; subclasses are listed there
+hil.estimator.errors.EstimationError  1   the recording does not determine the parameters
 """
 
 import signal

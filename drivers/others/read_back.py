@@ -266,7 +266,7 @@ class ReadBack:
         return None
 
     def _are_latest(self, servos: Sequence[Answer], goals: Sequence[int]) -> bool:
-        """Return whether all servos hold their latest goals and report no error, which is the usual case."""
+        """Return whether all servos hold their latest goals and report no error."""
         watchdogs: list[tuple[int, int]] = []
         for answer, goal in zip(servos, goals, strict=True):
             if not answer or answer[0] or answer[-1] != goal:

@@ -39,6 +39,9 @@ TRIP_S = WATCHDOG_UNIT + 5e-3
 _REPEATS, _REPEAT_S = 2, 0.001
 """Number of further torque-off packets and the time between them [s]: a packet that collides with a reply is lost."""
 
+_READINGS = 3
+"""Number of times that Torque Enable is read until its readings agree."""
+
 
 @dataclass(frozen=True)
 class TorqueOff:
@@ -74,7 +77,7 @@ class TorqueOff:
         on: joints whose servos' torque is on again each time it is cut. silent: joints whose servos have not
         answered since.
         """
-        why = "Another program had switched its torque on again, and it has not answered since."
+        why = "Another program had switched its torque on again, and its answers since are missing or contradictory."
         return replace(
             self,
             confirmed=tuple(joint for joint in self.confirmed if joint not in {*on, *silent}),
@@ -277,12 +280,15 @@ def is_torque_on(servo: Servo) -> bool | None:
 def has_torque(servo: Servo) -> bool | None:
     """Read whether a servo's torque is on; None if its answers may belong to other requests.
 
-    A reply does not identify its register, so Torque Enable is read twice, with another register in between. Raises the
-    errors of `Servo.read`.
+    A reply does not identify its register, so Torque Enable is read twice, with another register in between, and again
+    if another program has changed it meanwhile. Raises the errors of `Servo.read`.
     """
-    first = servo.read_despite_error("Torque Enable")
-    is_its_own = servo.read_despite_error("ID") == servo.id
-    return bool(first) if is_its_own and servo.read_despite_error("Torque Enable") == first else None
+    for _ in range(_READINGS):
+        first = servo.read_despite_error("Torque Enable")
+        is_its_own = servo.read_despite_error("ID") == servo.id
+        if is_its_own and servo.read_despite_error("Torque Enable") == first:
+            return bool(first)
+    return None
 
 
 def was_rebooted(servo: Servo) -> bool | None:

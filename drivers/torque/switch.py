@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 from hil.drivers.errors import BusShared, DriverError, ServoFault, ServoRefused, TorqueNotOff
 from hil.drivers.joint import Joint
 from hil.drivers.packet import HardwareError
-from hil.drivers.port import Port
+from hil.drivers.port import GROWTH, Port
 from hil.drivers.preparation.prepare import fault_text, shuts_down
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import WATCHDOG_UNIT, Mode
@@ -117,6 +117,7 @@ class TorqueSwitch:
         if not 1 <= ticks <= 127:
             raise ValueError(f"watchdog must be 0.02 to 2.54 s, not {watchdog}")
         self._watchdog = watchdog
+        self.port.late_replies, self.port.growth = 0, 1
         for joint, servo in self._servos.items():
             watched = joint not in self._without_watchdog
             if watched:
@@ -144,6 +145,7 @@ class TorqueSwitch:
         with signals_held_back():
             silent = self._silent()
             confirmed, unconfirmed = cut_torque(self.port, self._servos, silent, self._watchdog, interrupts)
+            self.port.growth = GROWTH
             fell_silent = {joint: self._servos[joint] for joint in confirmed if joint in silent & self._armed}
             reset = {joint: was_rebooted(servo) for joint, servo in fell_silent.items()}
             watched = {joint: self._servos[joint] for joint in confirmed if joint not in self._without_watchdog}

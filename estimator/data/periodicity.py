@@ -74,8 +74,8 @@ class Decay:
     def is_drift(self, correlation: float) -> bool:
         """Return whether the change looks like a drift of friction or torque rather than a transient.
 
-        A drift keeps changing the motion in the same direction over many periods; a transient oscillates or decays
-        faster. correlation: see `correlation_of_changes`.
+        A drift changes the motion in the same direction for many periods; a transient oscillates or decays faster.
+        correlation: see `correlation_of_changes`.
         """
         return self.ratio >= SLOWLY and correlation >= ALIKE
 

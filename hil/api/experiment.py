@@ -15,7 +15,7 @@ from hil.clearance.doubts import doubts
 from hil.config.schema import Config
 from hil.drivers.errors import DriverError
 from hil.dry_run.ensemble import earlier_result
-from hil.errors import ConfigError, ExperimentError, StopRequested
+from hil.errors import ConfigError, StopRequested
 from hil.estimation.after_a_stop import after_a_failure, after_a_stop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
@@ -30,7 +30,7 @@ __all__ = ["identify", "record"]
 
 log = logging.getLogger(__name__)
 
-_UNSETTLED = re.compile("TORQUE IS ON|could not be restored")
+_UNSETTLED = re.compile("TORQUE|restored|changed during|nother program")
 """If an error message matches this, the state of the servos must be checked before anything else."""
 
 
@@ -145,10 +145,15 @@ def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: P
     if isinstance(stopped, KeyboardInterrupt | StopRequested):
         said = after_a_stop(run, command, shown)
     else:
-        said = after_a_failure(run, shown) if isinstance(stopped, ExperimentError | DriverError) else []
-    if said and _UNSETTLED.search("\n".join([str(stopped), *getattr(stopped, "__notes__", [])])):
+        failed = isinstance(stopped, DriverError) or getattr(stopped, "exit_code", 0) == 1
+        said = after_a_failure(run, shown) if failed else []
+    if said and _is_unsettled(stopped):
         said[-1] = next_step("check", shown)
     return said
+
+
+def _is_unsettled(stopped: BaseException) -> bool:
+    return bool(_UNSETTLED.search("\n".join([str(stopped), *getattr(stopped, "__notes__", [])])))
 
 
 @contextmanager
@@ -163,7 +168,7 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
             with suppress(Exception):  # a failing hint must not hide what stopped the arm, or its torque state
                 for line in _how_to_go_on(stopped, run, command, shown):
                     stopped.add_note(line)
-        elif isinstance(stopped, DriverError) and hasattr(stopped, "__notes__"):  # with the servos' torque state
+        elif hasattr(stopped, "__notes__") and (isinstance(stopped, DriverError) or _is_unsettled(stopped)):
             stopped.add_note(next_step("check", shown))
         raise
 

@@ -4,6 +4,7 @@ signal number.
 While an arm may move, hil.experiment.stop_request handles these signals; the exit codes are the same.
 """
 
+import _thread
 import signal
 import sys
 import threading
@@ -16,11 +17,12 @@ import typer
 
 from hil.next_step import next_step
 
+_LOADERS, _LATER_S = frozenset({"importlib", "_frozen_importlib", "numba", "llvmlite"}), 0.02
+"""Packages whose work a signal does not interrupt, and the time after which it is repeated [s]."""
+
 
 class Terminated(KeyboardInterrupt):
-    """Raised on SIGTERM or SIGHUP, as KeyboardInterrupt is on Ctrl-C, so that everything is cleaned up in the same
-    way.
-    """
+    """Raised on Ctrl-C, SIGTERM or SIGHUP, so that everything is cleaned up in the same way."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -58,10 +60,21 @@ def same_again(stopped: BaseException) -> list[str]:
 
 
 def _catch() -> dict[signal.Signals, Any]:
-    """Catch signals that would end the program silently; leave those that are already handled or ignored (nohup)."""
-    caught = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) == signal.SIG_DFL]
+    """Catch the signals; leave those that are already handled or ignored (nohup)."""
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    caught = [each for each in signals if signal.getsignal(each) in (signal.SIG_DFL, signal.default_int_handler)]
     return {each: signal.signal(each, _raise) for each in caught}
 
 
-def _raise(number: int, _frame: FrameType | None) -> None:
+def _raise(number: int, frame: FrameType | None) -> None:
+    """Raise Terminated, but not before modules are loaded.
+
+    In callbacks of compiled modules that are being loaded, Python ignores exceptions: the stop would be lost.
+    """
+    inner = frame
+    while inner is not None:
+        if inner.f_globals.get("__name__", "").partition(".")[0] in _LOADERS:
+            threading.Timer(_LATER_S, _thread.interrupt_main, [number]).start()
+            return
+        inner = inner.f_back
     raise Terminated(number)

@@ -46,8 +46,8 @@ _ERRORS_IN_A_ROW = 3
 may be rejecting its goals.
 """
 
-NONE_HEARD = "No servo was heard"
-"""Beginning of the message if the arm is stopped because no servo replies."""
+NONE_HEARD, LOST = "No servo was heard", "Requests or replies are lost"
+"""Beginnings of the explanation if the arm is stopped because no servo replies, or because one does not."""
 
 
 class Guard:
@@ -336,7 +336,7 @@ class Guard:
         if heard := self._heard_instead():
             return heard
         if len(self._missing) == 1 or not all(self._missing):
-            return "Requests or replies are lost: check its cable and its supply."
+            return f"{LOST}: check its cable and its supply."
         # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
         shared = f"{NONE_HEARD}; requests or replies are lost: check the adapter, the cables and the supply"
         if self._silence.is_busy:

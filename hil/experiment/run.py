@@ -1,5 +1,6 @@
 """Run the experiment on the bus: open, check, switch torque on, stream, and always switch torque off."""
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,11 +14,12 @@ from hil.drivers.adapter.latency import WANTED_MS, command_to_set, latency_timer
 from hil.drivers.bus import ServoBus
 from hil.drivers.clock import Clock, WallClock
 from hil.drivers.errors import DriverError, PortLost, ServoFault, TorqueNotOff, WrongSetting
+from hil.drivers.servo import LATE
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
 from hil.estimator.chain.simulation.rollout import ChainArms
-from hil.experiment.guard import MOST_OUTSIDE_RAD, NONE_HEARD
+from hil.experiment.guard import LOST, MOST_OUTSIDE_RAD, NONE_HEARD
 from hil.experiment.model_watch import UNLIKE_ANY_ARM
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
@@ -184,8 +186,8 @@ def _play(
         note(f"stopped: {cause or 'end of the run.'} {about_torque(bus)}")
         if isinstance(error, TorqueNotOff):
             _try_again(bus, note)
-        if (who := _who_was_silent(bus, cause)) and isinstance(cause, SafetyStop):
-            cause.args = (str(cause).partition(NONE_HEARD)[0] + who,)
+        if isinstance(cause, SafetyStop) and (who := _why_silent(bus, cause)):
+            cause.args = (str(cause).partition(NONE_HEARD)[0].partition(LOST)[0] + who,)
             note(who)
         if isinstance(error, TorqueNotOff) and (instead := confirmed_later(bus, error)):
             if isinstance(instead, DriverError | HilError):
@@ -220,11 +222,15 @@ def _try_again(bus: ServoBus, note: Note) -> None:
                 note(f"{drive.title} answers again; {bus.torque_off_report}")
 
 
-def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
-    """If no servo was heard, say which ones answered when torque was cut: a silent servo hides those after it."""
+def _why_silent(bus: ServoBus, stop: SafetyStop) -> str:
+    """Say that replies were late if they arrived once torque was cut. If no servo was heard, say which ones answered
+    then: a silent servo hides those after it.
+    """
     report = bus.torque_off_report
-    if not isinstance(stop, SafetyStop) or stop.cause is not Cause.MISSING or report is None:
+    if stop.cause is not Cause.MISSING or report is None:
         return ""
+    if bus.port.late_replies and not bus.port.strangers and re.search(f"{NONE_HEARD}|{LOST}", str(stop)):
+        return LATE
     silent = {joint for joint, _ in report.unconfirmed} | report.later | report.rebooted
     heard = [str(joint) for joint in bus.drives if joint not in silent]
     if NONE_HEARD not in str(stop) or not silent or not heard:

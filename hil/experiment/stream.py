@@ -303,8 +303,8 @@ class Stream:
         if drifts:
             return (
                 f"{self._bus.joints[self._repetition.worst].title} changes most ({listed}): friction may hold it for "
-                "part of each period, or its torque may have changed. Raise its experiment.peak_torque if `hil "
-                "dry-run` allows it; otherwise, check its supply and look for a dragging cable or a slipping joint."
+                "part of each period, or its torque may have changed. Raise its peak_torque, or check its supply, "
+                "cable and coupling."
             )
         return (
             f"The change decreases from period to period ({listed}), by a factor of {decay.ratio:.2g} each time: the "

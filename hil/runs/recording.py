@@ -13,7 +13,6 @@ from enum import IntEnum
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,8 +149,8 @@ class Recorder:
     def close(self) -> None:
         """Truncate the file to the recorded rows; may be called repeatedly.
 
-        Raises RunFolderError if the file was removed or renamed in the meantime; its rows are then saved in a new file,
-        together with the configuration and the other files that were there when the recording began.
+        Raises RunFolderError if this fails, or if the file was removed or renamed in the meantime; its rows are then
+        saved in a new file, with the configuration and the other files that were there when the recording began.
         """
         if self._bytes.nbytes == 0:
             return
@@ -162,9 +161,17 @@ class Recorder:
             self._samples = _cut(self._path, self._samples, self.count)
         except FileNotFoundError:
             self._samples = self.samples.copy()
-            self._save_again()
+            lost = self._save_again()
+        except OSError as error:
+            lost = RunFolderError(
+                f"{self._path} cannot be cut to its {self.count} samples ({error.strerror}), but holds all of them."
+            )
+        else:
+            return
+        lost.exit_code = 1  # the input was right
+        raise lost from None
 
-    def _save_again(self) -> NoReturn:
+    def _save_again(self) -> RunFolderError:
         folder = self._path.parent
         said = f"{folder} was removed or renamed while the run was being recorded"
         try:
@@ -174,8 +181,8 @@ class Recorder:
                 if not (folder / name).exists():
                     (folder / name).write_bytes(contents)
         except OSError as error:
-            raise RunFolderError(f"{said}, and its samples cannot be saved to a new file: {error.strerror}.") from error
-        raise RunFolderError(
+            return RunFolderError(f"{said}, and its samples cannot be saved to a new file: {error.strerror}.")
+        return RunFolderError(
             f"{said}. Its {self.count} samples have been saved again in {folder}, with the configuration as it was "
             "when the recording began."
         )

@@ -144,7 +144,10 @@ class RunFolder:
 
         The same --out can then be used again. A folder with a sample, a result or a foreign file is kept.
         """
-        files = [path for path in self.path.rglob("*") if path.is_file()]
+        try:
+            files = [path for path in self.path.rglob("*") if path.is_file()]
+        except OSError:  # too many open files
+            return False
         if any(path.name not in _OF_A_START and not path.name.endswith(_DESCRIPTIONS) for path in files):
             return False
         if any(path.name == "samples.npy" and _has_samples(path) for path in files):

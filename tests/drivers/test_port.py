@@ -74,7 +74,8 @@ def test_a_servo_answered_with_anothers_id_is_not_called_silent(answering: int |
         if answering is not None:
             received.extend(encode(answering, Instruction.STATUS, b"\x00\xfc\x03\x2e"))
 
-    port = Mock(clock=clock, baud=1_000_000, latency=1e-3, echoes=False, strangers=0, write=write, read=read)
+    port = Mock(clock=clock, baud=1_000_000, latency=1e-3, echoes=False, write=write, read=read)
+    port.strangers, port.late_replies, port.growth = 0, 0, 1
     port.wire_time.return_value, port.has_input.return_value = 1e-4, False
     said = "does not answer" if answering is None else "Requests to .* are answered by ID 2 .* mixed up"
     with pytest.raises(NoReply, match=said):

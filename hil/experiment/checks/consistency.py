@@ -31,8 +31,7 @@ Lag and scale error are properties of a servo and do not change. A lag that chan
 (`hil.experiment.velocity.lag`). Once the motion has revealed lag and scale error, up to twice the estimated values are
 accepted, plus `MORE_LAG_S` and `MORE_SCALE` and twice their standard deviations.
 
-The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). Its state for a joint is a
-record of type `MEMORY`.
+Part of the compiled loop `joint_checks`; a record of type `MEMORY` is a joint's state.
 """
 
 from collections.abc import Iterable

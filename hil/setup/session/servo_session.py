@@ -21,6 +21,7 @@ from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import PROTECTIVE, read_settings
 from hil.drivers.servo_model import Mode
 from hil.drivers.torque.off import and_list, signals_held_back
+from hil.drivers.torque.switch import WATCH_S
 from hil.setup.changed_settings import Settings, settings_now
 from hil.setup.others import others_on_the_bus
 from hil.setup.session import settings_file
@@ -164,12 +165,20 @@ class ServoSession:
     def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
         """Cut torque where it is on and restore these servos' settings; return whether there was anything to do.
 
+        If it has been switched on before, it is watched for WATCH_S: a single reading may come between two switches.
+
         failed: receives the errors of the servos whose settings could not be restored.
         """
         if not self._is_ours:
             return False
-        self._torque = self.bus.torque_now()
-        on = [joint for joint, is_on in self._torque.items() if is_on]
+        clock = self.bus.port.clock
+        until = clock.now() + (WATCH_S if self._on_again else 0.0)
+        while True:
+            self._torque = self.bus.torque_now()
+            on = [joint for joint, is_on in self._torque.items() if is_on]
+            if on or clock.now() >= until:
+                break
+            clock.wait_until(clock.now() + WATCH_S / 10)
         if not on or max(self._on_again.get(joint, 0) for joint in on) >= _MOST_CUTS:
             return False
         self.bus.cut_foreign_torque(on)

@@ -227,13 +227,22 @@ class Misunderstood:
 
 
 @pytest.mark.parametrize(
-    ("answers", "on"), [([1, 1, 1], True), ([0, 1, 0], False), ([1, 3, 1], None), ([1, 1, 0], None), ([1], None)]
+    ("answers", "on"),
+    [
+        ([1, 1, 1], True),
+        ([0, 1, 0], False),
+        ([1, 3, 1], None),
+        ([1, 1, 0], None),
+        ([1], None),
+        ([0, 1, 1, 1, 1, 1], True),  # switched on between the two readings
+        (3 * [0, 1, 1], None),
+    ],
 )
 def test_torque_is_known_only_from_answers_to_the_question(answers: list[int], on: bool | None) -> None:
     assert is_torque_on(Misunderstood(answers)) is on  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("answers", "is_named"), [([1, 1, 1, 1, 0], True), ([0], False), ([1, 1, 3, 1], False)])
+@pytest.mark.parametrize(("answers", "is_named"), [([1, 1, 1, 1, 0], True), ([0], False), ([1, *3 * [1, 3]], False)])
 def test_no_other_program_is_accused_by_an_answer_to_another_question(answers: list[int], is_named: bool) -> None:
     found = switched_on({JOINTS[0]: Misunderstood(answers)})  # type: ignore[dict-item]
     assert found.startswith(JOINTS[0].title) is is_named and bool(found) is is_named

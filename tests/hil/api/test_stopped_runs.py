@@ -127,6 +127,9 @@ def test_exit_in_a_progress_callback_is_logged_and_an_interrupt_reaches_the_main
     [
         ("Torque is off on both servos.", "record"),
         ("The settings of joint 'elbow' could not be restored.", "check"),
+        ("Some settings of joint 'elbow' may not have been restored.", "check"),
+        ("Joint 'elbow': PWM Limit was changed during this command from 885 to 400.", "check"),
+        ("Another program switched torque on at joint 'elbow'.", "check"),
         ("TORQUE IS ON at ID 1.", "check"),
     ],
 )
@@ -147,3 +150,12 @@ def test_a_bus_failure_before_the_first_sample_ends_with_a_command() -> None:
     with pytest.raises(BusShared), experiment._discarding(run, "record", Path("a.toml")):
         raise stopped
     assert stopped.__notes__[-1] == "Next: hil check a.toml"
+
+
+def test_a_signal_before_the_first_sample_ends_with_a_check_if_settings_are_in_doubt() -> None:
+    run: Any = type("Unused", (), {"discard_if_unused": lambda _: True})()
+    stopped = StopRequested("Stopped by Ctrl-C.")
+    stopped.add_note("The settings of joint 'elbow' could not be restored. The next hil check restores them.")
+    with pytest.raises(StopRequested) as ended, experiment._discarding(run, "record", Path("a.toml")):
+        raise stopped
+    assert stopped.__notes__[-1] == "Next: hil check a.toml" and ended.value.exit_code == 130

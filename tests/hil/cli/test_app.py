@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -145,6 +146,21 @@ def test_too_many_open_files_are_no_wrong_input(is_cause: bool) -> None:
     lost.__cause__ = raised if is_cause else OSError(errno.EACCES, "Permission denied")
     assert exit_code(lost) == (1 if is_cause else 2)
     assert exit_code(raised) == 1
+
+
+def test_without_free_file_descriptors_torque_and_recording_are_still_said(
+    arm_file: ArmFile, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> Any:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr("hil.runs.recording._cut", fails)
+    monkeypatch.setattr(Path, "rglob", fails)
+    assert hil("record", arm_file(), "--out", tmp_path / "run") == 1
+    said = capsys.readouterr().err.splitlines()
+    assert re.search(r"samples\.npy cannot be cut to its \d+ samples \(Too many open files\), but holds all", said[0])
+    assert said[1] == "Torque is off on both servos, confirmed by reading it back."
+    assert said[-1] == f"Next: hil estimate {tmp_path / 'run'}", "the rows are there"
 
 
 def test_bad_arguments_and_files(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:

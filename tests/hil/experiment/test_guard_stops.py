@@ -116,6 +116,11 @@ CAUSES: list[tuple[Cause, str, Callable[[list[Any]], None]]] = [
     ),
     (Cause.ALERT, r"'elbow'.*overload", lambda p: fault(p, FaultKind.OVERLOAD, servo=2)),
     (Cause.MISSING, r"'elbow'.*missed 6 replies", lambda p: fault(p, FaultKind.LOST_REPLY, servo=2, duration=0.1)),
+    (
+        Cause.MISSING,
+        r"missed .*\. Replies did arrive, but too late: .*, the USB hub",
+        lambda p: fault(p, FaultKind.LATE_REPLY, amount=0.06, duration=0.003),
+    ),
     (Cause.LATE, r"deadlines in a row", lambda p: stall(p, 0.06)),
     (
         Cause.JUMP,

@@ -263,7 +263,7 @@ def test_what_forbids_an_experiment_is_found_before_torque(
     with pytest.raises(kind, match=said):
         run(arm(change), tmp_path / "run")
     assert_no_torque(ports[0])
-    assert ports[0].bus.plant.position == pytest.approx([-np.pi / 2, 0.0], abs=1e-3), "the arm did not move"
+    assert ports[0].bus.plant.position == pytest.approx([-np.pi / 2, 0.0], abs=5e-3), "the arm did not move"
 
 
 def test_a_servo_in_another_mode_is_brought_into_current_mode_and_back(

@@ -101,6 +101,7 @@ def test_samples_outlive_their_folder(tmp_path: Path, reason: str) -> None:
         and "was removed or renamed" in said
         and f"2 samples have been saved again in {path.parent}" in said
     )
+    assert reason or caught.value.exit_code == 1, "the input was right"
     assert (path.parent / "config.toml").read_text(encoding="utf-8") == "[port]"
     assert load_samples(path, 2)["deadline"].tolist() == [7.0, 8.0]
 

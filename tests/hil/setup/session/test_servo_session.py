@@ -240,6 +240,16 @@ def test_a_servo_that_answers_again_after_torque_off_is_off_and_put_back(
     assert "missed" in stopped and "replies in a row" in stopped, "the cause, not only that torque was left on"
 
 
+@pytest.mark.parametrize("seconds", [0.07, 0.15])
+def test_settings_are_restored_although_an_adapter_holds_back_all_replies_now_and_then(
+    arm: Arm, bench: Bench, seconds: float, state_folder: Path
+) -> None:
+    with servo_session(arm(SHORT)):
+        bus = bench.port.bus
+        bus.faults.add(Fault(kind="late_reply", at=bus.time, amount=seconds, probability=0.05))
+    assert bench.changed() == [] and not list(state_folder.glob("*.json"))
+
+
 @pytest.mark.parametrize("servo", [1, 2])
 def test_a_servo_that_rebooted_is_named_with_those_that_were_fine(
     arm: Arm, tmp_path: Path, bench: Bench, servo: int
@@ -366,6 +376,27 @@ def test_torque_that_another_program_keeps_switching_on_is_said_in_capitals(
     assert "CUT THE SUPPLY NOW" in said and "Torque is off on joint 'shoulder' (ID 1" in said
     assert "both servos" not in "\n".join((said, *getattr(stop, "__notes__", ())))
     assert ("It swings." in said) is (stop is not None)
+
+
+def test_a_program_that_switches_torque_on_now_and_then_does_not_pass_for_one_that_has_stopped(
+    arm: Arm, bench: Bench
+) -> None:
+    """Every 30 ms, so that the reading after a cut finds torque off, whatever follows."""
+    config = arm(SHORT)
+    with pytest.raises(TorqueNotOff) as ended, servo_session(config), servo_session(config) as bus:
+        with bus.torque(config.safety.watchdog):
+            pass
+        servo, write, next_at = bench.servos[2], bench.port.write, bus.port.clock.now()
+
+        def watched(data: bytes) -> Any:
+            nonlocal next_at
+            if (now := bus.port.clock.now()) >= next_at:
+                next_at = now + 0.03
+                servo.write(64, b"\x01")
+            return write(data)
+
+        bench.port.write = watched
+    assert message(ended.value).startswith("hil: TORQUE IS ON AT JOINT 'ELBOW'")
 
 
 def test_torque_that_another_program_keeps_switching_on_before_a_run_is_not_said_to_be_off(
