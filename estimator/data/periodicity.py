@@ -63,13 +63,11 @@ def settling_difference(former: Array, latest: Array) -> float:
 class Decay:
     """A change from period to period that decreases by about the same factor each time.
 
-    ratio: that factor. further: number of further periods until the change is within tolerance. latest: the latest
-    change.
+    ratio: that factor. further: number of further periods until the change is within tolerance.
     """
 
     ratio: float
     further: int
-    latest: float
 
     def is_drift(self, correlation: float) -> bool:
         """Return whether the change looks like a drift of friction or torque rather than a transient.
@@ -97,7 +95,7 @@ def decay_of(differences: Sequence[float], within: float) -> Decay | None:
     if not ratio <= SLOWEST:
         return None
     further = max(1, math.ceil(math.log(within / falling[-1]) / math.log(ratio)))
-    return Decay(ratio, further, falling[-1]) if len(differences) + further <= MOST_PERIODS else None
+    return Decay(ratio, further) if len(differences) + further <= MOST_PERIODS else None
 
 
 def correlation_of_changes(position: Array) -> float:

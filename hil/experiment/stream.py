@@ -294,7 +294,7 @@ class Stream:
         listed = ", ".join(f"{each:.1%}" for each in differences)
         played = len(differences) + decay.further
         drifts = decay.is_drift(self._correlation(samples))
-        if drifts and decay.latest <= WARMEST:
+        if drifts and differences[-1] <= WARMEST:
             seconds = (self._plan.warm_up_periods + played) * samples * self._pace.interval
             return (
                 f"The change decreases slowly from period to period ({listed}), as happens while grease warms up: set "
