@@ -19,6 +19,7 @@ EXTENDED_POSITION_MODE = 4
 CURRENT_POSITION_MODE = 5
 PWM_MODE = 16
 POSITION_MODES = frozenset({POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_POSITION_MODE})
+GOAL_OF_MODE = {CURRENT_MODE: "Goal Current", VELOCITY_MODE: "Goal Velocity", PWM_MODE: "Goal PWM"}
 
 FULL_PWM = 885
 """Goal PWM at which the whole supply voltage is applied to the motor."""

@@ -6,8 +6,9 @@ the behaviour that demands more of a client: see "Conformance" in docs/fake-bus.
 - A write must begin and end on register boundaries. One that begins or ends inside a writable register causes a Data
   Length error; other violations cause an Access error. A read may begin inside a register; undefined bytes between two
   registers read as 0. A read that begins or ends at an undefined address causes an Access error.
-- When the Bus Watchdog trips, Goal Current, Goal PWM and Goal Velocity become 0, Goal Position becomes Present
-  Position, and torque stays enabled. The watchdog's register then accepts only 0.
+- When the Bus Watchdog trips, the goal of the operating mode stops the motor: Goal Current, Goal PWM or Goal Velocity
+  becomes 0, or Goal Position becomes Present Position, where the servo goes on holding. The goals that only limit other
+  modes remain, and torque stays enabled. The watchdog's register then accepts only 0.
 - At power-up, and after a change of Operating Mode, Goal Current and Goal PWM equal their limits: if a client enables
   torque in current mode without first writing a goal, full current flows. Goal Velocity is 0.
 
@@ -20,7 +21,16 @@ from random import Random
 
 from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError
 from hil.fakes.servo.backup import Backup, factory_reset
-from hil.fakes.servo.controller import CURRENT_MODE, POSITION_MODE, POSITION_MODES, Controller, Goals, obeyed_current
+from hil.fakes.servo.controller import (
+    CURRENT_MODE,
+    CURRENT_POSITION_MODE,
+    GOAL_OF_MODE,
+    POSITION_MODE,
+    POSITION_MODES,
+    Controller,
+    Goals,
+    obeyed_current,
+)
 from hil.fakes.servo.encoder import PERFECT, Encoder, Reading
 from hil.fakes.servo.health import Health, Overload, Thermal
 from hil.fakes.servo.memory import Memory
@@ -171,9 +181,13 @@ class EmulatedServo(Powered):
         """Trip the Bus Watchdog: stop the motor and refuse goals until 0 is written to the register."""
         memory = self.memory
         memory.set("Bus Watchdog", WATCHDOG_TRIPPED)
-        for name in ("Goal Current", "Goal PWM", "Goal Velocity", "Profile Velocity", "Profile Acceleration"):
+        for name in PROFILE:
             memory.set(name, 0)
-        self._hold_position()
+        if self._mode in POSITION_MODES:
+            self._hold_position()
+        elif self._mode in GOAL_OF_MODE:
+            memory.set(GOAL_OF_MODE[self._mode], 0)
+            self.controller.start(self.present.ticks(self._angle()))
         self._derive()
 
     def fail(self, error: HardwareError) -> None:
@@ -425,8 +439,9 @@ class EmulatedServo(Powered):
         accepts = bool(self.model.operating_modes) and not by_goal and watchdog != WATCHDOG_TRIPPED
         self._goal_pwm_limit = memory.get("PWM Limit") if accepts and "Goal PWM" in memory else -1
         """Largest Goal PWM on the fast path [ticks]; -1 if the general path is used."""
-        # The fast path bypasses the controller, which computes the current where the supply limits it.
-        self._takes_goal_current = accepts and not self._voltage_limited and self._current_limit >= 0
+        # The fast path bypasses the controller, which limits the current by the supply or, in one mode, by the goal.
+        by_controller = self._voltage_limited or self._mode == CURRENT_POSITION_MODE
+        self._takes_goal_current = accepts and not by_controller and self._current_limit >= 0
         if self.needs_ticks:
             self.controller.goals = Goals.read(self._mode, memory)
         self.changed()

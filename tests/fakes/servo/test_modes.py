@@ -216,6 +216,52 @@ def test_watchdog_stops_velocity_and_position_control() -> None:
     assert abs(rig.read("Present Velocity")) <= 1
 
 
+def test_a_servo_turns_again_once_its_watchdog_has_been_cleared() -> None:
+    """The example of the e-Manual's page on the Bus Watchdog, steps 1 to 8."""
+    rig = Rig(1)
+    rig.write("Torque Enable", 1)
+    rig.write("Bus Watchdog", 100)
+    rig.run(2.5)
+    assert rig.servo.watchdog_tripped
+    rig.write("Bus Watchdog", 0)
+    rig.write("Goal Velocity", 150)
+    rig.run(1.0)
+    assert rig.read("Present Velocity") == pytest.approx(150, abs=3)
+    assert rig.read("Goal PWM") == 885
+
+
+@pytest.mark.parametrize("mode", [3, 4, 5])
+def test_a_tripped_watchdog_holds_a_joint_in_position_modes(mode: int) -> None:
+    rig = Rig(mode)
+    rig.write("Bus Watchdog", 5)
+    rig.write("Torque Enable", 1)
+    rig.write("Goal Position", 3000)
+    rig.run(3.0)
+    assert rig.servo.watchdog_tripped
+    held = rig.read("Present Position")
+    assert 2048 < held < 2990
+    assert abs(held - rig.read("Goal Position")) <= 20
+    rig.write("Bus Watchdog", 0)
+    rig.write("Goal Position", 2048)
+    rig.run(4.0)  # current-based control swings for seconds
+    assert abs(rig.read("Present Position") - 2048) <= 6
+
+
+def test_a_new_goal_current_limits_current_based_position_control_at_once() -> None:
+    rig = Rig(5)
+    rig.write("Goal Current", 3)
+    rig.write("Torque Enable", 1)
+    rig.write("Goal Position", 3000)
+    rig.run(0.05)
+    assert rig.read("Present Current") == 3
+    rig.write("Goal Current", 50)
+    rig.run(0.05)
+    assert rig.read("Present Current") > 10
+    rig.write("Goal Current", 2)
+    rig.run(0.05)
+    assert rig.read("Present Current") <= 2
+
+
 def test_torque_off_lets_go_at_once() -> None:
     rig = Rig(1)
     rig.write("Torque Enable", 1)
