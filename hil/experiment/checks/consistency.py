@@ -142,7 +142,7 @@ stored [s]. count: number of values stored so far. d1, t1 to d3, t3: the latest 
 
 MEMORY = np.dtype(
     [
-        *((name, "f8") for name in ("position", "velocity")),
+        *((name, "f8") for name in ("position", "velocity", "unsure")),
         *((name, "f8") for name in ("seconds", "moved", "difference", "unknown", "most_curved")),
         *((name, "f8") for name in ("turn", "seen", "headed", "heading", "moving")),
         *((name, "f8") for name in ("rough", "roughness")),
@@ -159,7 +159,7 @@ MEMORY = np.dtype(
 """State of the check of one joint.
 
 position, velocity, turn: latest values, and latest change of velocity [rad, rad/s]; the position is NaN before the
-first one and after a long gap. seconds, moved, difference, unknown, most_curved: sums (for the last one, the maximum)
+first one and after a long gap. unsure: uncertainty of the time of the latest measurement [s]. seconds, moved, difference, unknown, most_curved: sums (for the last one, the maximum)
 since the long memory was last updated. seen: `difference` without motion that the velocity register cannot show.
 headed: time of motion in the positive direction minus that in the negative one since then [s]. rough: sum of squares of
 the errors that velocity jumps may cause in each interval since then [rad^2]. heading, roughness, moving: in the slow
@@ -181,13 +181,14 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
 
     unsure: excess duration of its exchange [s], the uncertainty of the measurement time.
     """
-    former, before = memory.position, memory.velocity
-    memory.position, memory.velocity = position, velocity
+    former, before, also_unsure = memory.position, memory.velocity, memory.unsure
+    memory.position, memory.velocity, memory.unsure = position, velocity, unsure
     short = memory.short
+    unknown = unsure * abs(velocity)
     if np.isnan(former):
-        _restart(short, velocity)
-        _restart(memory.long, velocity)
-        _restart(memory.slow, velocity)
+        _restart(short, velocity, unknown)
+        _restart(memory.long, velocity, unknown)
+        _restart(memory.slow, velocity, unknown)
         memory.turn = memory.heading = memory.roughness = 0.0
         memory.moving = 0.0
         _forget_sums(memory)
@@ -200,13 +201,14 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
     curved = CURVED * seconds * turned
     if short.far == 0.0 and short.curved == 0.0:
         curved = max(curved, CURVED_AT_FIRST * 0.5 * seconds * abs(before + velocity))
-    unknown = unsure * abs(velocity)
-    known = LAG_S * turned + SCALE * abs(moved) + curved + unknown
+    # A late measurement takes from the next interval what it adds to its own.
+    at_both_ends = unknown + also_unsure * abs(before)
+    known = LAG_S * turned + SCALE * abs(moved) + curved + at_both_ends
     if _has_jumped(memory.steps, abs(difference) - known, seconds):
         return True
     if velocity != before or abs(velocity) < SLOW_RAD_S:
         _begin_same(memory.same)
-    elif _is_frozen(memory.same, moved, velocity, seconds, unknown, memory.scale):
+    elif _is_frozen(memory.same, moved, velocity, seconds, at_both_ends, memory.scale):
         return True
     _add(short, SHORT_S, moved, difference, velocity, seconds, curved, unknown)
     if _is_wrong(short, short.apart, UNSURE_RAD, velocity, memory.lag, memory.scale):
@@ -280,7 +282,7 @@ def _looks_long(memory: Any, velocity: float) -> bool:
     moved, difference, unknown = memory.moved, memory.difference, memory.unknown
     _add(long, LONG_S, moved, difference, velocity, seconds, memory.most_curved, unknown)
     _add(slow, SLOW_S, moved, memory.seen, velocity, seconds, memory.most_curved, 0.0)
-    slow.unknown = long.unknown  # a late measurement takes from the next interval what it adds to this one
+    slow.unknown = long.unknown  # as above: what a late measurement adds does not remain
     fades = min(seconds / SLOW_S, 1.0)
     memory.heading += memory.headed - fades * memory.heading
     memory.moving -= fades * memory.moving
@@ -373,8 +375,9 @@ def _has_jumped(steps: Any, step: float, seconds: float) -> bool:
     return bool(steps.count >= STEPS)
 
 
-def _restart(fading: Any, velocity: float) -> None:
-    fading.apart = fading.far = fading.span = fading.curved = fading.unknown = 0.0
+def _restart(fading: Any, velocity: float, unknown: float) -> None:
+    fading.apart = fading.far = fading.span = fading.curved = 0.0
+    fading.unknown = unknown
     fading.mean = fading.highest = fading.lowest = velocity
 
 

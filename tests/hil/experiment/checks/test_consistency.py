@@ -151,6 +151,34 @@ def test_healthy_joints_are_never_stopped(
         assert not look.look(read, quantised(velocity, TICK), 1 / rate)
 
 
+@pytest.mark.parametrize("rate", [100, 400, 1000])
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000), share=st.floats(0.02, 0.5), latest=st.floats(0.001, 0.008), since=st.floats(0, 5))
+@example(seed=2, share=0.3, latest=0.008, since=3.0)
+def test_healthy_joints_are_not_stopped_because_exchanges_are_late(
+    rate: int, seed: int, share: float, latest: float, since: float
+) -> None:
+    """On a busy computer, a servo measures at any time between the write and the read, which are far apart.
+
+    share, latest: fraction of late exchanges, and their largest delay [s]. since: when the computer becomes busy [s].
+    After a gap that is too long, the check begins anew, as it does in `joint_checks`.
+    """
+    random = Random(seed)
+    look, now, last, nearly = Consistency(), 0.0, 0.0, 1e-4
+    frequency, speed = random.uniform(0.3, 2.0), random.uniform(1.0, 4.0)
+    waves = [(frequency * ratio, random.uniform(0, math.tau)) for ratio in (1.0, 2.3)]
+    while now < 6.0:
+        late = random.uniform(0.0, latest) if now > since and random.random() < share else 0.0
+        measured = now + random.choice((0.0, 1.0, random.random())) * late + nearly
+        angle = sum(speed / 2 / (math.tau * f) * math.sin(math.tau * f * measured + phase) for f, phase in waves)
+        velocity = sum(speed / 2 * math.cos(math.tau * f * measured + phase) for f, phase in waves)
+        if now - last > 3 / rate:
+            look.lost()
+        assert not look.look(quantised(angle, STEP), quantised(velocity, TICK), now - last, late)
+        last, done = now, now + late + 2 * nearly
+        now = max(now + 1 / rate, done)
+
+
 def test_after_a_lost_reply_it_begins_anew() -> None:
     look = Consistency()
     for index in range(400):
