@@ -133,6 +133,7 @@ def setup(
     json_only: Json = False,
 ) -> None:
     """Set a servo's ID, baud rate, return delay or Secondary ID. Asks before each write and reads each value back."""
+    from hil.cli.views.question import agrees
     from hil.cli.views.setup_view import changed, print_changes
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
@@ -152,7 +153,7 @@ def setup(
             print(f"Restored settings left behind by an earlier run: {written}.", file=sys.stderr)
         if restored.others:
             print(f"{servo.title}: {restored.others}", file=sys.stderr)
-        confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm
+        confirm: Callable[[str], bool] = (lambda _: True) if yes else agrees
         changes = set_up(
             servo,
             confirm,

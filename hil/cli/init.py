@@ -19,6 +19,7 @@ def init(
 ) -> None:
     """Scan the bus, ask for other data, and write a commented TOML file. Torque stays off; no setting is changed."""
     from hil.cli.terminal import Terminal
+    from hil.cli.views.question import answer
     from hil.config.fake_url import url_for
     from hil.config.schema import parse_config, port_url
     from hil.drivers.port import open_port
@@ -42,7 +43,7 @@ def init(
             raise ConfigError(f"--out {out}: the folder {out.parent} does not exist. Create it first.")
         with terminal.scanning() as watch:
             heard = list(scan(opened, bauds, watch))
-        answers = interview(opened, url_for(url, out), heard, _default if yes else _prompt, _say)
+        answers = interview(opened, url_for(url, out), heard, _default if yes else answer, _say)
     finally:
         opened.close()
     parse_config(arm_toml(answers), out)  # raises if the file would not be valid
@@ -53,11 +54,6 @@ def init(
     parse_config(text, out)
     write_text(out, text)
     print(f"Wrote {out}. Read it, then type the next command.\n{next_step('check', out)}")
-
-
-def _prompt(question: str, usual: str) -> str:
-    answer: str = typer.prompt(question, default=usual, show_default=bool(usual), err=True)
-    return answer.strip()
 
 
 def _default(_question: str, usual: str) -> str:

@@ -1,5 +1,6 @@
 """`hil init` creates a valid file from the servos on the bus and a few answers."""
 
+import io
 import math
 import sys
 from collections.abc import Callable
@@ -45,6 +46,37 @@ def test_defaults_make_a_file_that_runs(arm_file: ArmFile, capsys: pytest.Captur
     assert "mine.toml already exists" in capsys.readouterr().err
     assert hil("init", "nonsense", "--yes", "--out", "mine.toml") == 2
     assert "Cannot open port 'nonsense'" in capsys.readouterr().err
+
+
+class _Interrupted(io.StringIO):
+    """Standard input at which Ctrl-C is typed."""
+
+    def readline(self, _size: int | None = -1, /) -> str:
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("typed", "code", "said"),
+    [(io.StringIO(), 2, "Add --yes"), (_Interrupted(), 130, "hil: Stopped by Ctrl-C.")],
+    ids=["end of input", "Ctrl-C"],
+)
+@pytest.mark.parametrize("command", ["init", "setup"])
+def test_a_question_without_an_answer_ends_the_command(
+    command: str,
+    typed: io.StringIO,
+    code: int,
+    said: str,
+    arm_file: ArmFile,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    options = ["--baud", 1_000_000] if command == "init" else ["--id", 1, "--return-delay-us", 20]
+    monkeypatch.setattr(sys, "stdin", typed)
+    assert hil(command, arm_file(), *options) == code
+    printed = capsys.readouterr().err
+    assert said in printed
+    assert "Aborted" not in printed
+    assert (f"Next: hil {command}" in printed) == (code == 130)
 
 
 def test_answers_are_asked_again_until_they_make_sense(arm_file: ArmFile) -> None:
