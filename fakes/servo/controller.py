@@ -33,8 +33,7 @@ _TIME_BASED = 0x04  # bit of Drive Mode
 _IN_POSITION = 0x01
 _PROFILE_ONGOING = 0x02
 _FOLLOWING_ERROR = 0x08
-_RECTANGLE = 0x10
-_TRAPEZOID = 0x30
+_RECTANGLE, _TRIANGLE, _TRAPEZOID = 0x10, 0x20, 0x30
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 
 
@@ -101,6 +100,7 @@ class Controller:
         self._error_before = 0.0
         self._goal_before: float | None = None
         self._fastest = self._hardest = 0.0
+        self._shape = _RECTANGLE
 
     def start(self, position_ticks: float) -> None:
         """Start from rest at the present position, when torque is switched on or the mode changes."""
@@ -157,7 +157,7 @@ class Controller:
             return 0
         status = _IN_POSITION if abs(goals.position - position_ticks) <= IN_POSITION_TICKS else 0
         if self.trajectory.velocity:
-            status |= _PROFILE_ONGOING | (_TRAPEZOID if goals.profile_acceleration else _RECTANGLE)
+            status |= _PROFILE_ONGOING | self._shape
         if abs(self.trajectory.position - position_ticks) > 4 * IN_POSITION_TICKS:
             status |= _FOLLOWING_ERROR
         return status
@@ -179,6 +179,7 @@ class Controller:
             self._fastest, self._hardest = profile(
                 away, goals.profile_velocity, goals.profile_acceleration, goals.time_based
             )
+            self._shape = _shape(away, trajectory.velocity, self._fastest, self._hardest)
         trajectory.step(goals.position, self._fastest, self._hardest)
         error = trajectory.position - position_ticks
         slope, self._error_before = error - self._error_before, error
@@ -192,3 +193,13 @@ class Controller:
         if abs(wanted) <= limit or wanted * integrated < 0.0:
             self._integral += integrated
         return max(-limit, min(limit, wanted))
+
+
+def _shape(away: float, velocity: float, fastest: float, hardest: float) -> int:
+    """Return the bits of Moving Status for a move of `away` ticks: a triangle never reaches its velocity limit.
+
+    velocity: at the start [ticks/ms]. fastest, hardest: as returned by `profile`.
+    """
+    if not hardest:
+        return _RECTANGLE
+    return _TRAPEZOID if fastest**2 <= hardest * abs(away) + 0.5 * velocity**2 else _TRIANGLE

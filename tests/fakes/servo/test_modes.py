@@ -137,6 +137,23 @@ def test_velocity_profile_is_a_trapezoid() -> None:
     assert abs(rig.read("Present Position") - 4000) <= 8
 
 
+def test_a_profile_that_never_reaches_its_velocity_is_a_triangle() -> None:
+    """x/moving_status: 10 for a triangular, 11 for a trapezoidal, 01 for a rectangular profile."""
+    rig = Rig(3)
+    rig.write("Profile Velocity", 100)  # 2.40 rad/s, reached after 0.38 rad at 7.49 rad/s^2
+    rig.write("Profile Acceleration", 20)
+    rig.write("Torque Enable", 1)
+    for goal, status in ((2048 + 400, 0x22), (2048, 0x22), (2048 + 600, 0x32), (2048, 0x32)):
+        rig.write("Goal Position", goal)
+        rig.run(0.1)
+        assert rig.read("Moving Status") & 0x32 == status
+        rig.run(1.5)
+    rig.write("Profile Acceleration", 0)
+    rig.write("Goal Position", 2100)
+    rig.run(0.005)
+    assert rig.read("Moving Status") & 0x32 == 0x12
+
+
 def test_time_profile_takes_its_time() -> None:
     rig = Rig(3, Drive_Mode=4)
     rig.write("Profile Velocity", 1000)  # ms for the whole move
