@@ -60,7 +60,13 @@ class ChainArm(Described):
                 raise ValueError(f"drives: {told[0]} of {name} is only supported by planar fake arms; leave it out")
             if drive.stops is not None and not drive.stops[0] <= angle <= drive.stops[1]:
                 raise ValueError(f"start: {angle:g} rad for joint {name} is beyond its stops {list(drive.stops)}")
-        _ = self.description
+        for joint, body in zip(self.description.joints, self.bodies, strict=True):
+            least = np.linalg.eigvalsh(body.inertia)[0]
+            if least < -1e-12:
+                raise ValueError(
+                    f'{self.urdf}: the fake arm cannot be simulated, because the inertia of link "{joint.link}" has a '
+                    f"negative principal moment ({least:.2g} kg m^2): correct its ixx to izz"
+                )
         return self
 
     @property
