@@ -19,12 +19,18 @@ Array = NDArray[np.float64]
 _CHUNK = 16384  # samples per block, chosen so that temporaries stay in the processor's cache
 
 
+UNKNOWN_SERVO = "unknown"
+
+
 @dataclass(frozen=True)
 class JointFacts:
     """Properties of a joint that are not part of its dynamics.
 
     mode: "current" (goals in A) or "pwm" (goals in V). torque_per_goal: N m/A or N m/V at the output shaft. goal_limit:
     A or V. position_limit: rad. velocity_limit: rad/s. servos: number of servos that drive the joint together.
+
+    Of an arm that is only known from a recording, the servo is `UNKNOWN_SERVO`, the limits are the recorded extremes,
+    and the torque per goal is 1 if torques were recorded.
     """
 
     name: str
@@ -38,7 +44,14 @@ class JointFacts:
     servos: int = 1
 
     @property
+    def has_limits(self) -> bool:
+        """Whether the limits are the joint's, not just the extremes of a recording."""
+        return self.servo != UNKNOWN_SERVO
+
+    @property
     def goal_unit(self) -> str:
+        if not self.has_limits and self.torque_per_goal == 1.0 and self.mode == "current":
+            return "N m"
         return "V" if self.mode == "pwm" else "A"
 
 

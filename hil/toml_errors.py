@@ -250,7 +250,9 @@ def _shown(value: object) -> str:
 
 def _allowed_keys(location: Sequence[str | int], root: type[BaseModel]) -> str:
     names = [name for name, field in fields_of(_table(location, root)).items() if not field.exclude]
-    close = difflib.get_close_matches(str(location[-1]), names, n=1)
+    given = str(location[-1])
+    same_letters = [name for name in names if sorted(name) == sorted(given)]
+    close = same_letters or difflib.get_close_matches(given, names, n=1)
     return f"did you mean {close[0]}?" if close else f"allowed: {', '.join(names)}"
 
 

@@ -11,6 +11,9 @@ from typing import Any
 
 from hil.description.regular_file import not_a_file
 
+MOST_BYTES = 4_000_000
+"""Largest size of a file: reading one takes seconds per megabyte of numbers."""
+
 
 class TomlFileError(ValueError):
     """Raised if a file cannot be read or is not TOML; the text is the complete message and names the file."""
@@ -31,13 +34,17 @@ def read_toml_text(path: Path) -> str:
     if said := not_a_file(path):
         raise TomlFileError(f"{path} cannot be read: {said}.")
     try:
-        return path.read_text(encoding="utf-8-sig")
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+        if len(data) <= MOST_BYTES:
+            return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         raise TomlFileError(f"{path} cannot be read: it is {_encoding_of(path, error)}.") from error
     except OSError as error:
         raise TomlFileError(f"{path} cannot be read: {error.strerror or error}.") from error
     except ValueError as error:
         raise TomlFileError(f"{str(path)!r} cannot be read: {error}.") from error
+    raise TomlFileError(f"{path} cannot be read: it is larger than {MOST_BYTES / 1e6:.0f} MB.")
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:

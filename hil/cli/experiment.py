@@ -133,7 +133,7 @@ def estimate(
         elsewhere = are_recordings(paths)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    elsewhere = elsewhere or paths[0].is_file()  # whose format is then refused by name
+    elsewhere = elsewhere or not (paths[0] / "config.toml").exists()  # neither: refused by name below
     if out is not None and not elsewhere:
         raise typer.BadParameter("--out is for recordings from other tools; a run's result is written into its folder.")
     if config is not None and not elsewhere:

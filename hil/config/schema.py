@@ -68,6 +68,15 @@ class PortConfig(Table):
     url: str = Field(
         min_length=1, description='device or pyserial URL; "fake://" opens the [fake] arm of the same file'
     )
+
+    @field_validator("url")
+    @classmethod
+    def _printable(cls, url: str) -> str:
+        """Reject control characters, which a terminal would obey."""
+        if not url.isprintable():
+            raise ValueError("must not contain line breaks, tabs or other unprintable characters")
+        return url
+
     baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
     one_write: bool = Field(True, description="send goals and read request in one write; set as hil check advises")
     fast_sync_read: bool = Field(True, description="use Fast Sync Read where every servo's firmware supports it")

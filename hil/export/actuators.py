@@ -28,5 +28,5 @@ def add_actuators(root: ET.Element, model: ArmModel | ChainArmModel) -> None:
             gainprm=numbers(model.torque_per_goal(number)),
             biastype="affine",
             biasprm=numbers(-model.values.get(f"offset_{number}", 0.0), -away, 0),
-            ctrlrange=numbers(-facts.goal_limit, facts.goal_limit),
+            **({"ctrlrange": numbers(-facts.goal_limit, facts.goal_limit)} if facts.has_limits else {}),
         )

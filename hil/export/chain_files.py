@@ -77,16 +77,17 @@ def _export_own_urdf(found: ChainLinks, model: ChainArmModel, path: Path) -> lis
     parent = found.arm.base
     for index, (joint, body) in enumerate(zip(found.arm.joints, found.bodies, strict=True)):
         _replace_inertial(ET.SubElement(root, "link", name=joint.link), body)
-        element = ET.SubElement(root, "joint", name=joint.name, type="revolute")
+        facts = model.joints[index]
+        element = ET.SubElement(root, "joint", name=joint.name, type="revolute" if facts.has_limits else "continuous")
         ET.SubElement(element, "parent", link=parent)
         ET.SubElement(element, "child", link=joint.link)
         ET.SubElement(element, "origin", xyz=numbers(*joint.translation), rpy=numbers(*_roll_pitch_yaw(joint.rotation)))
         ET.SubElement(element, "axis", xyz=numbers(*joint.axis))
-        facts = model.joints[index]
-        low, high = facts.position_limit
-        effort = facts.goal_limit * model.torque_per_goal(index + 1)
-        bounds = {"lower": low, "upper": high, "velocity": facts.velocity_limit, "effort": effort}
-        ET.SubElement(element, "limit", {key: numbers(value) for key, value in bounds.items()})
+        if facts.has_limits:
+            low, high = facts.position_limit
+            effort = facts.goal_limit * model.torque_per_goal(index + 1)
+            bounds = {"lower": low, "upper": high, "velocity": facts.velocity_limit, "effort": effort}
+            ET.SubElement(element, "limit", {key: numbers(value) for key, value in bounds.items()})
         friction = {"damping": f"viscous_{index + 1}", "friction": f"coulomb_{index + 1}"}
         ET.SubElement(element, "dynamics", {key: numbers(model.values[name]) for key, name in friction.items()})
         parent = joint.link
@@ -111,16 +112,17 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
     parent = ET.SubElement(root, "worldbody")
     _add_geoms(parent, [solid for solid in solids if solid.link == 0])
     for index, (joint, body) in enumerate(zip(found.arm.joints, found.bodies, strict=True)):
-        number = index + 1
+        number, facts = index + 1, model.joints[index]
+        limits = facts.position_limit if facts.has_limits else joint.limits
         place = {"pos": numbers(*joint.translation), "quat": numbers(*_quaternion(joint.rotation))}
         parent = ET.SubElement(parent, "body", {"name": joint.link, **place})
         ET.SubElement(
             parent,
             "joint",
+            {} if limits is None else {"range": numbers(*limits)},
             name=joint.name,
             type="hinge",
             axis=numbers(*joint.axis),
-            range=numbers(*model.joints[index].position_limit),
             armature=numbers(found.armature[index]),
             damping=numbers(model.values[f"viscous_{number}"]),
             frictionloss=numbers(model.values[f"coulomb_{number}"]),

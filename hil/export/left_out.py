@@ -41,4 +41,5 @@ def torque_constants(model: ArmModel) -> list[str]:
     return [
         f"torque per goal of {joint.name} = {model.torque_per_goal(number):.6g} N m/{joint.goal_unit}"
         for number, joint in enumerate(model.joints, start=1)
+        if joint.goal_unit != "N m"
     ]

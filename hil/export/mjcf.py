@@ -46,11 +46,10 @@ def _add_body(parent: ET.Element, model: ArmModel, index: int, link: LinkMass, a
     ET.SubElement(
         body,
         "joint",
-        spring,
+        spring | ({"range": numbers(*facts.position_limit)} if facts.has_limits else {}),
         name=facts.name,
         type="hinge",
         axis=axis(model),
-        range=numbers(*facts.position_limit),
         # The inertia of link 1 includes the rotor of joint 1.
         armature=numbers(model.values.get(f"armature_{number}", 0.0)),
         damping=numbers(model.values[f"viscous_{number}"]),

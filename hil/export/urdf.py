@@ -52,19 +52,20 @@ def _add_link(root: ET.Element, number: int, link: LinkMass) -> None:
 
 def _add_joint(root: ET.Element, model: ArmModel, index: int, along: float) -> None:
     facts, number = model.joints[index], index + 1
-    element = ET.SubElement(root, "joint", name=facts.name, type="revolute")
+    element = ET.SubElement(root, "joint", name=facts.name, type="revolute" if facts.has_limits else "continuous")
     ET.SubElement(element, "parent", link=f"link_{index}" if index else "base")
     ET.SubElement(element, "child", link=f"link_{number}")
     ET.SubElement(element, "origin", xyz=numbers(along, 0, 0))
     ET.SubElement(element, "axis", xyz=axis(model))
-    low, high = facts.position_limit
-    ET.SubElement(
-        element,
-        "limit",
-        lower=numbers(low),
-        upper=numbers(high),
-        velocity=numbers(facts.velocity_limit),
-        effort=numbers(facts.goal_limit * model.torque_per_goal(number)),
-    )
+    if facts.has_limits:
+        low, high = facts.position_limit
+        ET.SubElement(
+            element,
+            "limit",
+            lower=numbers(low),
+            upper=numbers(high),
+            velocity=numbers(facts.velocity_limit),
+            effort=numbers(facts.goal_limit * model.torque_per_goal(number)),
+        )
     friction = {"damping": f"viscous_{number}", "friction": f"coulomb_{number}"}
     ET.SubElement(element, "dynamics", {key: numbers(model.values[name]) for key, name in friction.items()})

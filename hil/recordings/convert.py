@@ -44,6 +44,10 @@ class Converted:
     unusable: bool = False
 
 
+_FEWEST_IN_A_SEGMENT = 6
+"""Fewest samples in a segment: its initial state alone takes two per joint."""
+
+
 def convert(table: Table, columns: Columns) -> Converted:
     """Convert `table` to recordings.
 
@@ -85,6 +89,12 @@ def convert(table: Table, columns: Columns) -> Converted:
         recordings = tuple(Recording(each.time, each.torque, each.position, step, whole.between) for each in long)
     except RecordingError as error:
         raise CsvError(f"{table.source}: {error}") from error
+    between = min(float(np.median(np.diff(each.time))) for each in recordings)
+    if whole.segment < _FEWEST_IN_A_SEGMENT * between:
+        raise CsvError(
+            f"{table.source}: columns.segment = {whole.segment:g} s: a segment must hold at least "
+            f"{_FEWEST_IN_A_SEGMENT} samples, here {_FEWEST_IN_A_SEGMENT * between:.2g} s."
+        )
     names = tuple(
         table.source if len(long) == 1 else f"{table.source}, part {number}" for number in range(1, len(long) + 1)
     )

@@ -86,7 +86,17 @@ def _flat(name: str, column: Any, feature: dict[str, Any]) -> dict[str, Values]:
         return {name: column.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy(zero_copy_only=False) * 1e-9}
     if pa.types.is_floating(kind) or pa.types.is_integer(kind):
         return {name: np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)}
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        return _from_text(name, column.to_pylist())
     return {}
+
+
+def _from_text(name: str, texts: list[str | None]) -> dict[str, Values]:
+    """Convert a column of numbers that were stored as text; return none if any of it is not a number."""
+    try:
+        return {name: np.array([np.nan if not text else float(text) for text in texts])}
+    except ValueError:
+        return {}
 
 
 def _labels(feature: dict[str, Any], size: int) -> list[str]:

@@ -5,11 +5,12 @@ import re
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
-from hil.arm_model import JointFacts
+from hil.arm_model import UNKNOWN_SERVO, JointFacts
 from hil.config.csv_columns import Columns
 from hil.config.recording import RecordingConfig, load_recording_config
 from hil.errors import ConfigError, CsvError
@@ -107,10 +108,19 @@ def _read(paths: Sequence[Path], columns: Columns) -> Converted:
     if len(recordings) > MOST_RECORDINGS:
         raise CsvError(f"{len(recordings)} recordings, more than {MOST_RECORDINGS}: give fewer files or episodes.")
     names = tuple(name for each in found for name in each.names)
+    _refuse_twice(recordings, names)
     stepped = tuple(bool(all(flags)) for flags in zip(*(each.stepped for each in found), strict=True))
     notes, doubts = _once(each.notes for each in found), _once(each.doubts for each in found)
     unusable = any(each.unusable for each in found)
     return Converted(_stepped_alike(recordings, found), names, stepped, found[0].columns, notes, doubts, unusable)
+
+
+def _refuse_twice(recordings: Sequence[Recording], names: Sequence[str]) -> None:
+    """Raise CsvError for a recording that is given twice: the same noise, counted twice, would halve the variances."""
+    for (first, one), (second, other) in combinations(zip(names, recordings, strict=True), 2):
+        same = np.array_equal(one.position, other.position, equal_nan=True)
+        if same and np.array_equal(one.torque, other.torque, equal_nan=True):
+            raise CsvError(f"{first} and {second} hold the same samples: give each recording once.")
 
 
 def _stepped_alike(recordings: tuple[Recording, ...], found: Sequence[Converted]) -> tuple[Recording, ...]:
@@ -203,7 +213,7 @@ def _arm(read: Converted, config: RecordingConfig) -> ArmFacts:
         joints.append(
             JointFacts(
                 name,
-                "unknown",
+                UNKNOWN_SERVO,
                 "pwm" if columns.drive in {"voltage", "pwm"} else "current",
                 gain,
                 0.0,

@@ -1,5 +1,6 @@
 """The spatial plant compared with the estimator's equations and MuJoCo; energy conservation and stiction."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -137,6 +138,15 @@ def test_stops_hold_and_ripple_and_load_act() -> None:
 def test_what_is_wrong_with_a_description_is_named(change: dict[str, object], message: str) -> None:
     given = {"urdf": str(VIPER), "joints": NAMES, "start": START, "drives": (drive(),) * 6, **change}
     with pytest.raises(ValidationError, match=message):
+        ChainArm.model_validate(given)
+
+
+def test_an_inertia_that_cannot_be_simulated_is_named(tmp_path: Path) -> None:
+    """A product of inertia that is too large makes a principal moment negative, and the motion not a number."""
+    text = re.sub('ixy="[^"]*"', 'ixy="0.5"', VIPER.read_text(encoding="utf-8"), count=2)
+    (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
+    given = {"urdf": str(tmp_path / "arm.urdf"), "joints": NAMES, "start": START, "drives": (drive(),) * 6}
+    with pytest.raises(ValidationError, match=r'the inertia of link ".*" has a negative principal moment'):
         ChainArm.model_validate(given)
 
 

@@ -64,7 +64,10 @@ def test_a_gripper_keeps_its_inertia_and_the_arm_its_dynamics(
     monkeypatch.setattr(chain_files, "add_actuators", lambda *_: None)
     terms = ("viscous", "coulomb", "offset", "coulomb_width")
     values = {f"{name}_{joint}": 0.02 for name in terms for joint in (1, 2, 3)} | {"moment_x_1": 0.1, "lag": 0.001}
-    joints = [SimpleNamespace(name=j.name, goal_unit="A", position_limit=j.position_limit) for j in config.joints]
+    joints = [
+        SimpleNamespace(name=j.name, goal_unit="A", position_limit=j.position_limit, has_limits=True)
+        for j in config.joints
+    ]
     model: Any = SimpleNamespace(
         values=values, stds=values, groups={"moment_x_1": ""}, joints=joints, base_gravity=np.ones(3)
     )

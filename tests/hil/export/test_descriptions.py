@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hil import load_model
-from hil.arm_model import ArmModel
+from hil.arm_model import UNKNOWN_SERVO, ArmModel
 from hil.errors import ExportError
 from hil.export.formats import export
 from hil.export.mass_distribution import distribute
@@ -92,6 +92,22 @@ def test_mujoco_carries_friction_offset_and_the_drive(identified: Path) -> None:
         mujoco.mj_step(engine, data)
     expected = np.array([0.1, -0.05]) * 1.8 - [model.values["offset_1"], model.values["offset_2"]]
     assert data.qfrc_actuator == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_recording_gives_no_limits(identified: Path) -> None:
+    """Its extremes are not the joints' stops, and what was recorded as torque is commanded as torque."""
+    mujoco = pytest.importorskip("mujoco", reason=NEEDS_MUJOCO)
+    model = load_model(identified)
+    joints = tuple(dataclasses.replace(each, servo=UNKNOWN_SERVO, torque_per_goal=1.0) for each in model.joints)
+    model = dataclasses.replace(model, joints=joints)
+    path, _ = write(model, identified, "mjcf")
+    engine = mujoco.MjModel.from_xml_path(str(path))
+    assert not engine.jnt_limited.any() and not engine.actuator_ctrllimited.any()
+    assert "Without limits" in path.read_text() and "elbow [N m]" in path.read_text()
+    path, left = write(model, identified, "urdf")
+    assert [joint.get("type") for joint in ET.parse(path).getroot().iter("joint")] == ["continuous", "continuous"]
+    assert "<limit" not in path.read_text()
+    assert not any("torque per goal" in each for each in left)
 
 
 def test_mujoco_carries_a_cable_that_pulls_and_one_that_pushes(identified: Path) -> None:

@@ -188,6 +188,9 @@ def test_parquet_and_a_lerobot_dataset() -> None:
     pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     parquet.write_table(pa.table(dict(zip(HEAD, (TIME, *ANGLES, *TORQUES), strict=True))), "a.parquet")
     check(read(Path("a.parquet")))
+    texts = [list(map(str, column)) for column in (TIME, *ANGLES, *TORQUES)]
+    parquet.write_table(pa.table(dict(zip(HEAD, texts, strict=True))), "texts.parquet")
+    check(read(Path("texts.parquet")))
     names = {"motors": ["shoulder.pos", "elbow.pos"]}
     features = {"observation.state": {"names": names}, "action": {"names": ["shoulder.effort", "elbow.effort"]}}
     Path("set/meta").mkdir(parents=True)
