@@ -96,7 +96,7 @@ class Guard:
         lower = (
             ""
             if config.experiment.pilot or is_lowering
-            else f" Lower experiment.peak_torque. {how_to_find_torque(config)}"
+            else f" Lower experiment.peak_torque, unless something pushed the arm. {how_to_find_torque(config)}"
         )
         self._lower_torque = lower
         commands = CommandLimits(config)

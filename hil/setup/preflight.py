@@ -276,6 +276,8 @@ def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, 
 def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     torque = servo.read("Torque Enable")
     fix = "Another program is driving it: stop that program first, or power-cycle the servo."
+    if torque and servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
+        fix = "A program that has ended left it on, and its watchdog has tripped. Power-cycle the servo."
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
 
 

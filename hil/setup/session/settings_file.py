@@ -2,7 +2,8 @@
 
 There is one file per servo in the user's state folder, named after port, ID and model: however a program ends, the next
 program on that port finds the file and restores the settings. If the adapter has a serial number, the file is named
-after the adapter instead of the port, whose name may later belong to another arm.
+after the adapter instead of the port, whose name may later belong to another arm. Otherwise it is also found if the port
+goes by another name, a link or the device itself.
 """
 
 import json
@@ -26,7 +27,7 @@ class Kept:
     """Saved settings of one servo.
 
     changed: the EEPROM registers that the program sets, with their values. program: the program's process ID. adapter:
-    persistent name of the USB adapter; "" if it has none.
+    persistent name of the USB adapter; "" if it has none. device: the device behind the port's name; "" if it has none.
     """
 
     port: str
@@ -37,6 +38,7 @@ class Kept:
     program: int
     since: str
     adapter: str = ""
+    device: str = ""
 
     @property
     def path(self) -> Path:
@@ -74,22 +76,39 @@ def _path(port: str, servo_id: int, model: str) -> Path:
     return state_folder() / f"{name}_ID{servo_id}_{model}.json"
 
 
+def _device(port: str) -> str:
+    return "" if "://" in port else os.path.realpath(port)
+
+
 def keep(
     port: str, servo_id: int, model: str, settings: dict[str, int], changed: dict[str, int], since: str = ""
 ) -> Kept:
     """Write the file of a servo; it is on disk when this function returns. Raises RunFolderError.
 
+    A file of the same servo under another name of the port is removed afterwards.
+
     since: when these settings were first saved; by default, now.
     """
     since = since or datetime.now().astimezone().isoformat(timespec="seconds")
-    kept = Kept(port, servo_id, model, settings, changed, os.getpid(), since, adapter_name(port))
+    kept = Kept(port, servo_id, model, settings, changed, os.getpid(), since, adapter_name(port), _device(port))
+    former = load(port, servo_id, model)
     write_durably(kept.path, {"schema": SCHEMA, **asdict(kept)})
+    if former is not None and former.path != kept.path:
+        forget(former)
     return kept
 
 
 def load(port: str, servo_id: int, model: str) -> Kept | None:
     """The settings that an earlier program left for this servo; None if there is no readable file."""
-    path = settings_path(port, servo_id, model)
+    own = settings_path(port, servo_id, model)
+    device = _device(port)
+    if (kept := _read(own)) is not None or own.exists() or not device or adapter_name(port):
+        return kept
+    others = map(_read, sorted(state_folder().glob(f"*_ID{servo_id}_{model}.json")))
+    return next((each for each in others if each is not None and each.device == device and not each.adapter), None)
+
+
+def _read(path: Path) -> Kept | None:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         if values.pop("schema") != SCHEMA:

@@ -56,6 +56,28 @@ def test_settings_are_found_by_their_adapter_whatever_its_port_is_called_now(mon
     assert settings_file.load("/dev/ttyUSB1", 1, "XM430-W350") is None
 
 
+def test_settings_are_found_by_a_link_and_by_the_device_behind_it(tmp_path: Path) -> None:
+    device, link, other = tmp_path / "ttyX", tmp_path / "arm", tmp_path / "other"
+    device.touch(), other.touch(), link.symlink_to(device)
+    kept = settings_file.keep(str(link), 1, "XM430-W350", {"Operating Mode": 3}, {"Operating Mode": 0})
+    assert settings_file.load(str(device), 1, "XM430-W350") == kept
+    assert settings_file.load(str(other), 1, "XM430-W350") is None
+    assert settings_file.load(str(device), 2, "XM430-W350") is None
+    again = settings_file.keep(str(device), 1, "XM430-W350", kept.settings, kept.changed)
+    assert settings_file.load(str(link), 1, "XM430-W350") == again
+    assert len(list(settings_file.state_folder().iterdir())) == 1
+
+
+def test_a_servo_whose_watchdog_has_tripped_is_not_said_to_be_driven(arm: Arm, bench: Bench) -> None:
+    config = arm(SHORT)
+    with servo_session(config):
+        pass
+    bench.servos[1].write(64, b"\1")
+    bench.servos[1].trip_watchdog()
+    torque = next(each for each in check_arm(config) if each.what == "torque")
+    assert torque.level is Level.STOP and "its watchdog has tripped" in torque.fix
+
+
 def test_threads_that_save_at_once_and_a_folder_removed_meanwhile_are_no_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
