@@ -327,7 +327,7 @@ class DescriptorPort(Port):
         self._forget_descriptor()
         with contextlib.suppress(*_FAILURES):
             self._serial.close()
-        device = device_of(self._adapter)
+        device = self.url if is_pseudo_terminal(self.url) else device_of(self._adapter)
         if device is None:
             return False
         try:

@@ -32,6 +32,14 @@ def inner(function: Any, **options: Any) -> Any:
     return compile_it(nogil=True, error_model="numpy", no_cfunc_wrapper=True, **options)(function)
 
 
+def embedded(function: Any, **options: Any) -> Any:
+    """Compile a function like `inner`, but without the wrapper for Python, an eighth of the time that compiling takes.
+
+    Only compiled code may call it: a call from Python ends the process.
+    """
+    return inner(function, no_cpython_wrapper=True, **options)
+
+
 def only_version(dispatcher: Any) -> Any:
     """Return the machine code of a compiled function that has been called with arguments of one set of types.
 

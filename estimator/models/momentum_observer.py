@@ -43,7 +43,7 @@ from typing import Any
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled, inner
+from hil.estimator.compiled import compiled, embedded
 from hil.estimator.models import earlier_model, standstill
 
 NAMES = (
@@ -484,7 +484,7 @@ def _observe_loop(
     return alarm
 
 
-_inner = partial(inner, _nrt=False)  # nothing in them allocates
+_inner = partial(embedded, _nrt=False)  # nothing in them allocates
 _regressors, _begin_anew, _filter = map(_inner, (_regressors, _begin_anew, _filter))
 _gain, _lacks, _learn = map(_inner, (_gain, _lacks, _learn))
 _keep_dissipative = _inner(_keep_dissipative)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import inner
+from hil.estimator.compiled import embedded
 from hil.estimator.models.parameters import SLIDING, Physics, place_of
 
 # Indices of joint 1's constants in `Physics.vector`; joint 2's follow.
@@ -83,5 +83,5 @@ def without_dry_friction(vector: Array) -> Array:
     return left
 
 
-inlined = partial(inner, forceinline=True, no_cpython_wrapper=True)
+inlined = partial(embedded, forceinline=True)
 bend = inlined(bend)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled, inner
+from hil.estimator.compiled import compiled, embedded
 
 
 def motor_torque(
@@ -133,5 +133,5 @@ def _follow(command: Any, j: int, rate: float, lag: float, lagging: Any) -> None
             by_a = (by_a + samples * a ** (samples - 1) * y) / (1.0 - left)
 
 
-_follow = inner(_follow, no_cpython_wrapper=True)
+_follow = embedded(_follow)
 _average: Callable[..., None] = compiled(_average_loop)

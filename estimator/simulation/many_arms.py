@@ -5,14 +5,13 @@ Equations, integration and feedback are those of `hil.estimator.simulation.close
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled, inner
+from hil.estimator.compiled import compiled, embedded
 from hil.estimator.models.parameters import Physics
 from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.arm import finer_pieces, steps_per_sample
@@ -122,11 +121,8 @@ def _two(torque: Array) -> Array:
     return both
 
 
-_inner = partial(inner, no_cpython_wrapper=True)
-
-
 # Compiled code takes its arguments by position.
-@_inner
+@embedded
 def _resting(pose: Any) -> Any:
     state = np.zeros((6, 2))
     for joint in range(2):
@@ -134,7 +130,7 @@ def _resting(pose: Any) -> Any:
     return state
 
 
-@_inner
+@embedded
 def _felt(gains: Any, scale: Any) -> Any:
     """Return the feedback as applied to an arm whose torques are `scale` times the assumed ones."""
     felt = gains.copy()
@@ -144,7 +140,7 @@ def _felt(gains: Any, scale: Any) -> Any:
     return felt
 
 
-@_inner
+@embedded
 def _scaled(command: Any, scale: Any) -> Any:
     scaled = command.copy()
     for joint in range(2):
@@ -153,7 +149,7 @@ def _scaled(command: Any, scale: Any) -> Any:
     return scaled
 
 
-@_inner
+@embedded
 def _raise(values: Any, position: Any, velocity: Any, torque: Any, scale: Any) -> None:
     for joint in range(2):
         for k in range(position.shape[1]):
@@ -169,7 +165,7 @@ def _raise(values: Any, position: Any, velocity: Any, torque: Any, scale: Any) -
             values[4, joint] = max(values[4, joint], t * v)
 
 
-@_inner
+@embedded
 def _difference(former: Any, latest: Any) -> float:
     """Return the worst joint's RMS difference between two periods' second halves, relative to the motion's RMS."""
     samples = former.shape[1]

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled, inner
+from hil.estimator.compiled import compiled, embedded
 from hil.estimator.models.parameters import CONSTANTS, ENCODER, Physics
 from hil.estimator.simulation.arm import (
     ASYMMETRY,
@@ -443,6 +443,6 @@ def _loop(
 # Only the loop is called from Python; wrappers for the others would take another second to compile. Calls that are not
 # inlined would spend more time on counting references to arrays than on arithmetic. None of this allocates, and code
 # without such counts is compiled a fifth faster.
-fused = partial(inner, fastmath={"contract"}, forceinline=True, no_cpython_wrapper=True, _nrt=False)
+fused = partial(embedded, fastmath={"contract"}, forceinline=True, _nrt=False)
 _drive, _arm, arm_step, follow = map(fused, (_drive, _arm, arm_step, follow))
 _advance: Callable[..., None] = compiled(_loop, fastmath={"contract"}, _nrt=False)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hil.estimator.chain.model.kernels import place
-from hil.estimator.compiled import compiled, inner
+from hil.estimator.compiled import compiled, embedded
 
 BASE = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 """Frame of the base: rotation matrix row by row, then origin."""
@@ -164,6 +164,6 @@ def _least_loop(chain: Any, shapes: Any, pairs: Any, needed: Any, q: Any, room: 
                 room[k], worst[k] = left, p
 
 
-_segments, _to_box, _box, _at, _distance = map(inner, (_segments, _to_box, _box, _at, _distance))
+_segments, _to_box, _box, _at, _distance = map(embedded, (_segments, _to_box, _box, _at, _distance))
 all_distances: Callable[..., None] = compiled(_all_loop)
 least_room: Callable[..., None] = compiled(_least_loop)

@@ -361,7 +361,7 @@ def invert(matrix: Any, inverse: Any, factor: Any) -> bool:  # noqa: PLR0912
 # Functions called only from compiled code need no wrappers for C. The large ones are part of several loops and cached,
 # so that a program that needs another of these loops later does not compile them again.
 _PLAIN: dict[str, Any] = {"fastmath": {"contract"}, "_nrt": False, "no_cfunc_wrapper": True}
-_inner: Any = numba.njit(nogil=True, error_model="numpy", **_PLAIN)
+_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, **_PLAIN)
 _cross, _dot, _push, _carry, _flow, _into = map(_inner, (_cross, _dot, _push, _carry, _flow, _into))
 place, move, accelerate, differentiate, regress, pull, invert = (
     compiled(each, **_PLAIN) for each in (place, move, accelerate, differentiate, regress, pull, invert)

@@ -23,7 +23,7 @@ from functools import partial
 from typing import Any
 
 from hil.estimator.chain.model.kernels import accelerate, differentiate, invert, move, place, pull, regress
-from hil.estimator.compiled import compiled, inner
+from hil.estimator.compiled import compiled, embedded
 from hil.estimator.simulation.arm import FADED, GAMMA
 
 # Rows of the joints' constants.
@@ -356,7 +356,7 @@ def _run_loop(  # noqa: PLR0912
 
 # Only the loop is called from Python. None of this allocates: without numba's reference counts, which cost an atomic
 # operation for every view of an array, it is a quarter faster.
-_inner = partial(inner, fastmath={"contract"}, _nrt=False, no_cpython_wrapper=True)
+_inner = partial(embedded, fastmath={"contract"}, _nrt=False)
 _left, _direct, _add_eight, _add_four, _multiply, _solve_for, _stage, _follow, _pieces, _broken = map(
     _inner, (_left, _direct, _add_eight, _add_four, _multiply, _solve_for, _stage, _follow, _pieces, _broken)
 )

@@ -41,7 +41,7 @@ import numpy as np
 
 from hil.drivers.state import State
 from hil.errors import Cause, SafetyStop
-from hil.estimator.compiled import inner
+from hil.estimator.compiled import embedded, inner
 from hil.experiment.velocity import bias, lag
 
 __all__ = ["MEMORY", "begin", "check_standstill", "look", "lost", "moved_at_standstill"]
@@ -427,11 +427,12 @@ def _explained(fading: Any, unsure: float, velocity: float, lag: float, scale: f
     return allowed, lag * (velocity - fading.mean)
 
 
-_explained = inner(_explained)
+_explained = embedded(_explained)
 _restart, _add, _is_wrong, _has_jumped, _forget_sums, _begin_same, _is_frozen = map(
-    inner, (_restart, _add, _is_wrong, _has_jumped, _forget_sums, _begin_same, _is_frozen)
+    embedded, (_restart, _add, _is_wrong, _has_jumped, _forget_sums, _begin_same, _is_frozen)
 )
 NOISE_RAD, NOISE_TIMES, _look_at_bias, _unexplained = bias.NOISE_RAD, bias.NOISE_TIMES, bias.look, bias.unexplained
 _add_to_lags, _forget_block = lag.add, lag.forget
-_creeps = inner(_creeps)
-_looks_long, _learn, look, lost = map(inner, (_looks_long, _learn, look, lost))
+_creeps = embedded(_creeps)
+_looks_long, _learn = map(embedded, (_looks_long, _learn))
+look, lost = map(inner, (look, lost))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hil.drivers.state import State
-from hil.estimator.compiled import compiled, inner, only_version
+from hil.estimator.compiled import compiled, embedded, only_version
 from hil.experiment.checks import consistency, following, work
 
 FINE = -1
@@ -174,5 +174,5 @@ def _look_loop(
     return FINE
 
 
-_may_be_outside, _fault = map(inner, (_may_be_outside, _fault))
+_may_be_outside, _fault = map(embedded, (_may_be_outside, _fault))
 _look: Callable[..., int] = compiled(_look_loop)

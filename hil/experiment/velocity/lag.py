@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.estimator.compiled import inner
+from hil.estimator.compiled import embedded, inner
 
 BLOCK_S, BLOCKS = 0.1, 4
 """Duration of a block [s], and the number of blocks that are compared with all earlier ones."""
@@ -124,6 +124,6 @@ def _fitted(sums: Any) -> tuple[float, float, float, float, float]:
     return lag, scale, determinant / far_2, max(left / seconds, NOISE_RAD * NOISE_RAD), determinant / lag_2
 
 
-_fitted = inner(_fitted)
-_completes_block = inner(_completes_block)
+_fitted = embedded(_fitted)
+_completes_block = embedded(_completes_block)
 add, forget = map(inner, (add, forget))
