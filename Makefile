@@ -15,7 +15,7 @@ demo: $(VENV)/installed
 	$(BIN)/hil identify configs/fake_two_link.toml
 
 test: $(VENV)/installed
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .

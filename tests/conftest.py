@@ -26,16 +26,16 @@ from tests.support.paths import CONFIGS
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Start with the tests that take a minute each, so that no worker is left with one at the end.
 
-    Of several workers, each starts with its part of the list, the second with those of spatial arms: it compiles their
-    loops while the first compiles those of planar arms, and later each finds on disk what the others have compiled.
+    Of two workers, the first then compiles the loops of planar arms while the second compiles those of spatial arms,
+    and later each finds on disk what the other has compiled.
     """
-    long = [item for item in items if item.get_closest_marker("long")]
-    spatial = [item for item in long if "chain" in item.nodeid]
-    planar = [item for item in long if item not in spatial]
-    others = [item for item in items if item not in long]
-    workers = max(2, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "2")))
-    second = max(0, len(items) // workers - len(planar))
-    items[:] = [*planar, *others[:second], *spatial, *others[second:]]
+
+    def turn(item: pytest.Item) -> int:
+        if item.get_closest_marker("long") is None:
+            return 2
+        return 1 if "chain" in item.nodeid else 0
+
+    items.sort(key=turn)
 
 
 def pytest_collection_finish() -> None:
