@@ -9,6 +9,7 @@ robots", IEEE Control Systems 27 (2007) 58.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -85,13 +86,33 @@ def filtered_rows(
         )
     from scipy.signal import butter, sosfiltfilt
 
-    filter_ = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
-    smooth = sosfiltfilt(butter(ORDER, position_cutoff or cutoff, fs=1.0 / dt, output="sos"), position, axis=1)
+    tau = sosfiltfilt(butter(ORDER, cutoff, fs=1.0 / dt, output="sos"), torque, axis=1)
+    # As bytes, which are compared in an instant: arrays have no hash.
+    given = position.tobytes(), position.shape[0], dt, cutoff, position_cutoff or cutoff, coulomb_width
+    return Rows(_filtered_regressor(*given, trim, keep), tau[:, trim:-trim:keep])
+
+
+@lru_cache(maxsize=4)  # the search for faults tries hundreds of torques with the same positions
+def _filtered_regressor(
+    positions: bytes,
+    joints: int,
+    dt: float,
+    cutoff: float,
+    position_cutoff: float,
+    coulomb_width: float,
+    trim: int,
+    keep: int,
+) -> Array:
+    from scipy.signal import butter, sosfiltfilt
+
+    position = np.frombuffer(positions).reshape(joints, -1)
+    smooth = sosfiltfilt(butter(ORDER, position_cutoff, fs=1.0 / dt, output="sos"), position, axis=1)
     velocity = np.gradient(smooth, dt, axis=1)
     acceleration = np.gradient(velocity, dt, axis=1)
-    Y = sosfiltfilt(filter_, regressor(smooth, velocity, acceleration, coulomb_width), axis=1)
-    tau = sosfiltfilt(filter_, torque, axis=1)
-    return Rows(Y[:, trim:-trim:keep], tau[:, trim:-trim:keep])
+    terms = regressor(smooth, velocity, acceleration, coulomb_width)
+    Y = sosfiltfilt(butter(ORDER, cutoff, fs=1.0 / dt, output="sos"), terms, axis=1)[:, trim:-trim:keep].copy("K")
+    Y.flags.writeable = False
+    return Y
 
 
 def fit_inverse_dynamics(

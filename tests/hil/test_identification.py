@@ -35,6 +35,9 @@ def identified(tmp_path_factory: pytest.TempPathFactory) -> Any:
     def identify(name: str) -> Identified:
         if name not in results:
             config = load_config(CONFIGS / f"{name}.toml")
+            if name == "fake_two_link_ideal":  # no test looks at its prediction, which takes half of the run
+                experiment = config.experiment.model_copy(update={"held_out": False})
+                config = config.model_copy(update={"experiment": experiment})
             run = RunFolder.create(tmp_path_factory.mktemp("runs") / name, config)
             run_experiment(config, run, config.path, lambda _: None)
             positions = load_samples(run.samples_path, 2)["position"]

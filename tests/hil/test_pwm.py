@@ -18,7 +18,7 @@ from hil.fakes.servo.registers import load_model
 from hil.plan.plan import make_plan
 from hil.runs.run_folder import RunFolder
 from tests.support.dry_runs import is_within, run_on
-from tests.support.edits import replaced
+from tests.support.edits import WITHOUT_HELD_OUT, replaced
 
 ArmFile = Callable[..., Path]
 
@@ -63,7 +63,7 @@ def test_goals_are_volts(voltage_driven: Config) -> None:
 def test_a_dry_run_knows_what_turning_motors_generate(arm_file: ArmFile, tmp_path: Path) -> None:
     path = by_voltage(arm_file)
     text = path.read_text(encoding="utf-8").replace("[arm]\n", "[arm]\nlink_lengths = [0.147, 0.180]\n", 1)
-    path.write_text(text.replace("[experiment]\n", "[experiment]\nheld_out = false\n", 1), encoding="utf-8")
+    path.write_text(replaced(text, *WITHOUT_HELD_OUT), encoding="utf-8")
     config = load_config(path)
     plan = make_plan(config)
     foreseen = predict(config, plan, prior_ensemble(config, 48))
@@ -112,7 +112,7 @@ def test_an_arm_driven_by_voltage_is_identified(arm_file: ArmFile, tmp_path: Pat
         text,
         ("torque_per_volt = 0.125", f"torque_per_volt = {1.80 / motor.resistance_ohm}"),
         ("torque_per_volt = 0.125", f"torque_per_volt = {1.80 / motor.resistance_ohm}"),
-        ("rate = 400.0 ", "rate = 200.0 "),
+        ("rate = 400.0 ", "rate = 100.0 "),
         ("period = 2.0 ", "period = 6.0 "),
         ("band = [0.5, 6.0]", "band = [0.17, 6.0]"),
         # Back-EMF damps so strongly that the arm approaches its periodic motion slowly.

@@ -26,7 +26,7 @@ def realistic(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("realistic")
     text = bundled_configs()["fake_two_link"].read_text(encoding="utf-8")
     path = folder / "arm.toml"
-    short = (("period = 10.0 ", "period = 4.0 "), ("[0.1, 5.0]", "[0.25, 5.0]"))
+    short = (("rate = 400.0 ", "rate = 200.0 "), ("period = 10.0 ", "period = 4.0 "), ("[0.1, 5.0]", "[0.25, 5.0]"))
     path.write_text(replaced(text, *short, ("[experiment]\n", "[experiment]\nheld_out = false\n")), "utf-8")
     config = load_config(path)
     run = RunFolder.create(folder / "run", config)

@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -41,11 +43,21 @@ def test_detecting_lines_are_odd_and_leave_one_in_four_out(joints: int) -> None:
         detecting_lines(1.0, (2.0, 4.5), 2, 1)
 
 
+@contextmanager
+def _quickly() -> Iterator[None]:
+    """Optimise from two starts instead of all, for what holds whatever the crest factor is; nothing is remembered."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(multisine, "STARTS", 1)
+        patch.setattr(multisine, "_low_crest_phases", multisine._low_crest_phases.__wrapped__)
+        yield
+
+
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 1000), st.integers(4, 12))
 def test_spectrum_and_peak_are_as_asked(seed: int, count: int) -> None:
     lines = (tuple(range(1, 2 * count, 2)), tuple(range(2, 2 * count + 1, 2)))
-    wave = design_multisine(100.0, 2.0, lines, (0.7, 0.3), seed)
+    with _quickly():
+        wave = design_multisine(100.0, 2.0, lines, (0.7, 0.3), seed)
     spectrum = np.abs(np.fft.rfft(wave.torque, axis=1)) * 2.0 / wave.samples
     for joint, excited in enumerate(lines):
         others = np.delete(spectrum[joint], list(excited))
@@ -92,7 +104,8 @@ def test_many_lines_take_no_more_evaluations_than_few(monkeypatch: pytest.Monkey
 
 def test_a_seed_is_a_multisine() -> None:
     lines = ((1, 3, 5, 7), (2, 4, 6, 8))
-    once, again, other = (design_multisine(100.0, 1.0, lines, (1.0, 1.0), seed) for seed in (5, 5, 6))
+    with _quickly():
+        once, again, other = (design_multisine(100.0, 1.0, lines, (1.0, 1.0), seed) for seed in (5, 5, 6))
     assert np.array_equal(once.torque, again.torque)
     assert np.abs(once.torque - other.torque).max() > 0.1
 

@@ -68,7 +68,7 @@ def test_fits_made_elsewhere_give_the_same_choice(recorded: Recorder, wave: Wave
 def test_friction_that_yields_before_it_slides_is_found_out(recorded: Recorder, wave: Wave) -> None:
     bristles = {"presliding_stiffness": 15.0, "presliding_damping": 0.5}
     arm = servo_arm({**STICKING, **bristles}, joints=1)
-    periods = [recorded(arm, wave(seed, (0.4,))) for seed in (1, 2)]
+    periods = [recorded(arm, wave(seed, (0.4,), 7.5)) for seed in (1, 2)]
     choice = choose(periods[:1], periods[1], "lag")
     found = choice.estimate
     assert "presliding" in found.model.options

@@ -38,7 +38,7 @@ def cogging(pendulum: Arm, recorded: Recorder, wave: Wave, seconds: float) -> Se
 
 
 def test_cogging_is_found_and_named(pendulum: Arm, recorded: Recorder, wave: Wave) -> None:
-    choice = choose([cogging(pendulum, recorded, wave, 10.0)], None, "delay")
+    choice = choose([cogging(pendulum, recorded, wave, 7.5)], None, "delay")
     found = choice.estimate.parameters
     assert choice.estimate.model.options == {"cogging"}
     assert np.hypot(found["cogging_sin_1"], found["cogging_cos_1"]) == pytest.approx(0.002, rel=0.02)

@@ -13,7 +13,7 @@ from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.plant import make_plant
 from tests.support.recorded_arm import SERVO, STEP
 
-RATE, SECONDS = 100.0, 6.0
+RATE, SECONDS = 100.0, 4.0
 HANGING = -math.pi / 2
 DRIVE = {**SERVO, "viscous": 0.03, "coulomb": 0.02, "coulomb_width": 0.02, "offset": 0.002}
 LINK = {"length": 0.2, "mass": 0.25, "centre": 0.15, "inertia": 1e-3}

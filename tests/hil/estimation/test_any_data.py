@@ -191,7 +191,7 @@ def test_compare_and_known_quantities_on_one_run(
     known = "[known]\nmass_1 = 0.18\nmass_2 = 0.2\nmass_elbow = 0.082\n" + (
         "rotor_inertia_1 = 8.0e-8\ngear_ratio_1 = 353.5\n\n[fake]\n"
     )
-    assert hil("identify", arm_file(("[fake]\n", known)), "--out", "run") == 0
+    assert hil("identify", arm_file(("[fake]\n", known), ("rate = 400.0 ", "rate = 200.0 ")), "--out", "run") == 0
     assert "centre_2" in capsys.readouterr().out
     physical = json.loads(Path("run/result.json").read_text(encoding="utf-8"))["physical"]
     assert physical["quantities"]["centre_2"]["value"] == pytest.approx(0.112, rel=0.005)

@@ -61,7 +61,7 @@ def test_turns_and_torque_constants_are_said_plainly() -> None:
 
 def test_a_recording_whose_first_torque_is_too_small_is_used_with_care_at_most() -> None:
     """The torque of joint 1 as logged is 0.7 times the true one, so that all values are 30 % too small."""
-    motion = two_joints(8.0)
+    motion = two_joints(5.0)
     torque = motion.torque * np.array([[0.7], [1.0]])
     recording = Recording(motion.time, torque, motion.position, np.full(2, 2 * np.pi / 4096), "held")
     wanted = ModelConfig(friction="stribeck", drive="delay", torque_scale=True)

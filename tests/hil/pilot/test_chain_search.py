@@ -35,7 +35,7 @@ from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 LEG = CONFIGS / "leg.toml"
-TEXT = replaced(LEG.read_text(encoding="utf-8"), ("period = 10.0", "period = 5.0"), ("rate = 400.0", "rate = 100.0"))
+TEXT = replaced(LEG.read_text(encoding="utf-8"), ("period = 10.0", "period = 4.0"), ("rate = 400.0", "rate = 100.0"))
 """A shorter experiment, so that designs and simulations take less time."""
 
 DESIGNED: dict[bytes, Paths] = {}

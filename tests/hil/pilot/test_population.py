@@ -24,7 +24,7 @@ def test_an_arm_that_is_given_its_torque_is_judged(tmp_path: Path) -> None:
     arm = draw(seed)
     given = (
         ("pilot = true", "peak_torque = [0.15]\nheld_out = false"),
-        ("rate = 400.0", "rate = 200.0"),
+        ("rate = 400.0", "rate = 100.0"),
         ("period = 10.0", "period = 4.0"),
         ("band = [0.1,", "band = [0.25,"),
         ('friction = "auto"', 'friction = "stribeck"'),

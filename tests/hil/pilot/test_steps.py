@@ -15,6 +15,7 @@ from rich.console import Console
 import hil
 from hil.cli.views.result_table import print_result
 from hil.config.schema import Config, load_config
+from hil.dry_run import stopping_distance
 from hil.errors import ConfigError
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
@@ -57,7 +58,7 @@ def first_time(tmp_path_factory: pytest.TempPathFactory) -> Config:
     path = tmp_path_factory.mktemp("first_time") / "first_time.toml"
     text = replaced(
         (CONFIGS / path.name).read_text(encoding="utf-8"),
-        ("rate = 400.0 ", "settle_within = 0.03\nrate = 200.0 "),
+        ("rate = 400.0 ", "settle_within = 0.03\nrate = 100.0 "),
         ("period = 10.0 ", "period = 6.0 "),
         ("band = [0.1,", "band = [0.167,"),
     )
@@ -74,7 +75,8 @@ def in_steps_counted(
     assert config.experiment.peak_torque is None and config.arm.prior is None
     run = RunFolder.create(tmp_path_factory.mktemp("steps") / "run", config)
     said: list[str] = []
-    with counted_eeprom_writes() as written:
+    with counted_eeprom_writes() as written, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stopping_distance, "_ARMS", 2)
         _, result = identify_in_steps(config, run, config.path, lambda _: None, said.append)
     return (result, run.path, said), written
 
@@ -136,7 +138,7 @@ def test_the_run_folder_estimates_again_with_the_torque_that_was_found(in_steps:
 
 def test_an_inverted_arm_is_identified_with_a_stabiliser(tmp_path: Path) -> None:
     text = (CONFIGS / "fake_inverted.toml").read_text(encoding="utf-8")
-    text = replaced(text, ("rate = 400.0 ", "rate = 200.0 "), ("period = 10.0 ", "period = 6.0 "))
+    text = replaced(text, ("rate = 400.0 ", "rate = 100.0 "), ("period = 10.0 ", "period = 6.0 "))
     (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
     config = load_config(tmp_path / "arm.toml")
     run = RunFolder.create(tmp_path / "run", config)

@@ -20,7 +20,7 @@ from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.errors import ConvergenceError
 from tests.support.command_line import hil
 
-SAMPLES = 2600  # of a period of 4000
+SAMPLES = 2000  # of a period of 4000
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,13 @@ from hil.estimation.slips.recorded_jumps import jump_sentences, recorded_jumps
 from hil.estimator.data.recording import Recording
 
 STEP = 2 * np.pi / 4096
+SECONDS = 8.0
 
 
 def recorded(seed: int, rate: float, disturb: Callable[[np.ndarray, np.ndarray], np.ndarray], lost: bool) -> Recording:
     """A joint that swings by about a radian, with times that jitter, read by an encoder; `lost`: without 3 % of it."""
     random = np.random.default_rng(seed)
-    time = (np.arange(round(15 * rate)) + random.uniform(-0.1, 0.1, round(15 * rate))) / rate
+    time = (np.arange(round(SECONDS * rate)) + random.uniform(-0.1, 0.1, round(SECONDS * rate))) / rate
     tones = zip(random.uniform(0.2, 3.0, 5), random.uniform(0.0, 6.0, 5), strict=True)
     position = np.sum([0.25 * np.sin(2 * np.pi * f * time + phase) for f, phase in tones], axis=0)
     position = np.round(disturb(time, position) / STEP) * STEP
@@ -38,7 +39,7 @@ def test_a_jump_is_found_with_its_time_and_size(rate: float, lost: bool) -> None
     for seed in range(10):
         random = np.random.default_rng(seed)
         steps = random.choice([-1, 1]) * random.integers(9, 60)
-        at = random.uniform(1.0, 14.0)
+        at = random.uniform(1.0, SECONDS - 1.0)
         assert recorded_jumps([recorded(seed, rate, lambda _, position: position, lost)]) == []
         recording = recorded(seed, rate, lambda time, row, at=at, size=steps: row + size * STEP * (time >= at), lost)
         for jump in recorded_jumps([recording]):
