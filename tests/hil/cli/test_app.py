@@ -187,7 +187,7 @@ def test_a_recording_cut_short_is_said(identified: Path, capsys: pytest.CaptureF
 
 def test_a_killed_process_leaves_its_samples_on_file(arm_file: ArmFile, tmp_path: Path) -> None:
     path = arm_file(*LONG)
-    with subprocess.Popen([sys.executable, "-m", "hil", "identify", str(path), "--out", "run"]) as process:
+    with forked.start(["hil", "identify", str(path), "--out", "run"]) as process:
         samples = tmp_path / "run" / "samples.npy"
         for _ in range(600):
             time.sleep(0.05)
