@@ -20,7 +20,7 @@ from hil.results.result import SettledResult
 from hil.runs.collection import find_runs
 from hil.setup.preflight import Level, check_arm
 from tests.support.command_line import hil as command
-from tests.support.edits import QUICK
+from tests.support.edits import QUICK, QUICK_WITH_HELD_OUT
 
 ArmFile = Callable[..., Path]
 
@@ -53,15 +53,15 @@ def test_identify_gives_what_the_command_writes(arm_file: ArmFile, capsys: pytes
     assert any(each.message.startswith("Torque is off") for each in heard)
 
 
-def test_record_then_estimate_is_identify(arm_file: ArmFile, identified_once: Path) -> None:
-    run = hil.record(arm_file(), out="run")
+def test_record_then_estimate_is_identify(arm_file: ArmFile) -> None:
+    path = arm_file(*QUICK_WITH_HELD_OUT)
+    run = hil.record(path, out="run")
     assert run.result is None and "not estimated" in repr(run)
     assert len(run.samples) == run.timing.samples > 1000
     with pytest.raises(ResultError, match="has no estimate"):
         _ = run.model
     result = hil.estimate(run)
-    known = hil.load_run(identified_once).result
-    assert known is not None and result.parameters == known.parameters
+    assert result.parameters == hil.identify(path, out="at_once").parameters
     again = hil.load_run("run")
     assert again.result == result and set(again.periods) == {"identify", "held_out"}
     assert again.events[-1][1].startswith("Torque is off")
