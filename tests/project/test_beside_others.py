@@ -78,8 +78,15 @@ def test_the_strangers_tests_pass_under_pytest_and_python_m_pytest(environment: 
 
 
 def test_the_command_works_among_them(environment: Path, project: Path) -> None:
-    for command in ((environment / "hil",), (environment / "python", "-m", "hil")):
-        assert "Ready" in run(project, *command, "check", "fake_two_link")
-    front_door = "assert hil.check('fake_two_link').ready and fakes.OWNER == 'stranger'"
-    where = run(project, environment / "python", "-c", f"import hil, fakes; {front_door}; print(hil.__file__)")
-    assert Path(where.strip()).is_relative_to(environment.parent)
+    """As script, and, where the project's folder precedes all others, as module and as library in one process."""
+    assert run(project, environment / "hil", "--version").startswith("hil 0.")
+    code = (
+        "import runpy, sys, hil, fakes\n"
+        "assert hil.check('fake_two_link').ready and fakes.OWNER == 'stranger'\n"
+        "print(hil.__file__, flush=True)\n"
+        "sys.argv[1:] = ['check', 'fake_two_link']\n"
+        "runpy.run_module('hil', run_name='__main__', alter_sys=True)\n"
+    )
+    where, said = run(project, environment / "python", "-c", code).split("\n", 1)
+    assert Path(where).is_relative_to(environment.parent)
+    assert "Ready" in said

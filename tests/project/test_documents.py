@@ -7,12 +7,16 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from hil.cli.app import COMMANDS, main
+from hil.report import png
+from hil.report.chart import Figure
+from hil.report.png import draw_figures
 from tests.support.edits import replaced
 from tests.support.paths import ROOT
 from tests.support.processes import forked
@@ -76,13 +80,27 @@ def place(identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         (here / "configs" / urdf.name).symlink_to(urdf)
     shutil.copytree(ROOT / "examples", here / "examples")
     study = here / "examples" / "studies" / "friction.toml"
-    fewer = replaced(study.read_text(encoding="utf-8"), ("runs = 6", "runs = 2"), ("[vary]", FEWER_SAMPLES))
+    fewer = replaced(
+        study.read_text(encoding="utf-8"),
+        ("runs = 6", "runs = 2"),
+        ("[vary]", FEWER_SAMPLES),
+        ("= [2.0]", "= [1.0]"),
+        ("= [0.5]", "= [1.0]"),
+    )
     study.write_text(fewer, encoding="utf-8")
     (here / "runs").mkdir()
     identified.rename(here / "runs" / "finished")
     monkeypatch.chdir(here)
     monkeypatch.setattr(sys, "argv", sys.argv)
+    monkeypatch.setattr(png, "draw_figures", drawn_coarsely)
     return here
+
+
+def drawn_coarsely(figures: Sequence[Figure], dpi: int = 90) -> Any:
+    """With few pixels and without a layout, which take most of the time; tests/hil/report/test_report.py has both."""
+    canvas = draw_figures(figures, min(dpi, 20))
+    canvas.set_layout_engine("none")
+    return canvas
 
 
 def text_of_new_servos(text: str) -> str:

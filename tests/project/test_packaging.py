@@ -56,7 +56,9 @@ def test_the_wheel_of_the_sdist_is_the_same_wheel(wheel: Path, tmp_path: Path) -
     assert {name.partition("/")[0] for name in contents[1]} == {"hil", f"hil-{hil.__version__}.dist-info"}
 
 
+@pytest.mark.slow
 def test_a_bundled_arm_is_checked_by_name_without_a_checkout(wheel: Path, tmp_path: Path) -> None:
+    """tests/project/test_beside_others.py does the same in an environment of its own, from the same unpacked wheel."""
     unpack(wheel, tmp_path / "installed")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "installed")}
     code = (

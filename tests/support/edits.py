@@ -15,6 +15,10 @@ QUICK = (
 """The same with half the period: an eighth of the samples."""
 
 
+QUICK_WITH_HELD_OUT = (*QUICK[:3], ("ramp = 1.0 ", "ramp = 0.3 "))
+"""As `QUICK`, with held-out data: a quarter of the samples."""
+
+
 def replaced(text: str, *changes: tuple[str, str]) -> str:
     """The text with the first occurrence of each old string replaced by the new one; each must occur."""
     for old, new in changes:

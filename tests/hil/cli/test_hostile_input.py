@@ -61,10 +61,8 @@ def test_a_link_made_by_somebody_else_while_the_cable_was_out_stays(arm_file: Ar
 
 
 @pytest.mark.usefixtures("few_stops")
-@pytest.mark.parametrize("names", [("[/red]é中", "<b>&\"'&amp;"), ("--", "]]>")])
-def test_a_name_that_is_markup_is_a_name(
-    arm_file: ArmFile, tmp_path: Path, names: tuple[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_name_that_is_markup_is_a_name(arm_file: ArmFile, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ("[/red]é中--", "<b>&\"'&amp;]]>")
     quoted = [name.replace("\\", "\\\\").replace('"', '\\"') for name in names]
     lengths = ("[arm]\n", "[arm]\nlink_lengths = [0.147, 0.18]\n")
     named = [(f'name = "{old}"', f'name = "{new}"') for old, new in zip(("shoulder", "elbow"), quoted, strict=True)]
@@ -72,8 +70,7 @@ def test_a_name_that_is_markup_is_a_name(
     run = tmp_path / "run"
     assert hil("identify", path, "--out", run) == 0
     assert hil("check", path) == 0
-    if names[0].startswith("[/red]"):
-        assert hil("dry-run", path, "--arms", 20) in (0, 1)
+    assert hil("dry-run", path, "--arms", 20) in (0, 1)
     said = capsys.readouterr().out
     assert "inertia_2" in said and all(name in said for name in names)
     assert hil("export", run, "--format", "urdf", "--format", "mjcf") == 0
