@@ -441,14 +441,20 @@ def _is_only_fake(path: Path) -> bool:
     return "fake" in values and "port" not in values and "joints" not in values
 
 
+def config_of(port: str) -> Path | None:
+    """The configuration that `port`, as given to `port_url`, means; None for a URL, a device or a fake arm."""
+    config = find_config(Path(port))
+    is_file = "://" not in port and (config.suffix == ".toml" or config.is_file())
+    return config if is_file and not _is_only_fake(config) else None
+
+
 def _url_of(port: str) -> str:
     if "://" in port:
         return port
-    config = find_config(Path(port))
-    if config.suffix == ".toml" or config.is_file():
-        return f"{FAKE_URL}{config}" if _is_only_fake(config) else load_config(config).url
+    if config := config_of(port):
+        return load_config(config).url
     arm = find_arm(port)
-    if arm.suffix == ".toml":
+    if arm.suffix == ".toml" or arm.is_file():
         return f"{FAKE_URL}{arm}"
     close = get_close_matches(port, [*arm_names(), *bundled_configs()], 1, 0.8)
     if close and not Path(port).exists():

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from hil import fakes
 from hil.cli.app import app
+from hil.cli.views.setup_view import print_scan
 from hil.config.schema import Config, load_config
 from hil.drivers.errors import NoReply, PortLost, WrongSetting
 from hil.drivers.port import Port, open_port
@@ -21,7 +22,7 @@ from hil.fakes.description import load_fake
 from hil.fakes.protocol_fake import open_fake
 from hil.setup import preflight
 from hil.setup.preflight import Finding, Level, check_arm
-from hil.setup.scan import Asking, listen, scan
+from hil.setup.scan import Asking, Found, Heard, listen, scan
 from hil.setup.servo_settings import open_servo, set_up
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
@@ -112,6 +113,27 @@ def test_scan_command(arm_file: ArmFile) -> None:
     result = invoke("scan", arm_file(), "--baud", 9600)
     assert result.exit_code == 1
     assert "No servo answered" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("port", "command"),
+    [
+        ("arm9", "init arm9 --out my_arm.toml"),
+        ("COM3", "init COM3 --out my_arm.toml"),
+        ("/dev/ttyUSB0", "init /dev/ttyUSB0 --out my_arm.toml"),
+        ("only_fake.toml", "init only_fake.toml --out my_arm.toml"),
+        ("xm430_two_link", "check xm430_two_link"),
+        ("arm.toml", "check arm.toml"),
+    ],
+)
+def test_after_a_scan_a_device_is_described_and_a_configuration_checked(
+    port: str, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("arm9").symlink_to("/dev/null")
+    Path("only_fake.toml").write_text("[fake]\n", encoding="utf-8")
+    print_scan([Heard(1_000_000, (Found(1_000_000, 1, 1020, "XM430-W350", 48, 12.0, 35.0, ""),), "")], port)
+    assert capsys.readouterr().out.splitlines()[-1] == f"Next: hil {command}"
 
 
 # check
