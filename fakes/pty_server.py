@@ -254,9 +254,9 @@ def _claim(link: Path) -> socket.socket:
             link.unlink()
         elif link.exists():
             raise LinkError(f"{link} already exists; remove it or choose another --link")
-    except OSError as error:
+    except OSError:
         claim.close()
-        raise error if isinstance(error, LinkError) else LinkError(f"{link} cannot be replaced: {error}") from error
+        raise
     return claim
 
 
