@@ -110,10 +110,11 @@ def print_changes(changes: Sequence[Change], port: str) -> None:
     if not changes:
         print("Nothing to change: give --new-id, --new-baud, --return-delay-us or --secondary-id.")
     for change in changes:
+        before, after = (f"{value} {change.unit}".rstrip() for value in (change.before, change.after))
         if change.written:
-            print(f"{change.register}: {change.before} -> {change.after}, read back.")
-        elif change.before == change.after:
-            print(f"{change.register} is already {change.after}.")
+            print(f"{change.register}: {before} -> {after}, read back.")
+        elif before == after:
+            print(f"{change.register} is already {after}.")
         else:
-            print(f"{change.register}: left at {change.before}.")
+            print(f"{change.register}: left at {before}.")
     print(next_step("scan", port))

@@ -340,6 +340,22 @@ def test_setup_command_asks(arm_file: ArmFile) -> None:
     assert invoke("setup", arm_file(), "--id", 2, "--new-baud", 12345).exit_code == 2
 
 
+def test_setup_reports_the_units_that_it_asks_in(arm_file: ArmFile) -> None:
+    words = ("setup", arm_file(), "--id", 2, "--yes")
+    assert "Return Delay Time: 0 us -> 20 us, read back" in invoke(*words, "--return-delay-us", 20).stdout
+    assert "Return Delay Time is already 0 us." in invoke(*words, "--return-delay-us", 0).stdout
+    assert "Baud Rate: 1000000 baud -> 57600 baud, read back" in invoke(*words, "--new-baud", 57_600).stdout
+    assert json.loads(invoke(*words, "--return-delay-us", 20, "--json").stdout)["changes"] == [
+        {"register": "Return Delay Time", "before": 0, "after": 20, "written": True, "unit": "us"}
+    ]
+
+
+def test_an_odd_return_delay_is_refused(arm_file: ArmFile) -> None:
+    result = invoke("setup", arm_file(), "--id", 2, "--yes", "--return-delay-us", 3)
+    assert result.exit_code == 2
+    assert "--return-delay-us 3: servos take even values from 0 to 508 only." in " ".join(result.output.split())
+
+
 @pytest.mark.parametrize("kind", ["lost_reply", "corrupted_reply", "lost_instruction", "truncated_reply"])
 @pytest.mark.parametrize("place", range(14))
 def test_one_lost_packet_loses_no_servo(port: Callable[..., Port], kind: str, place: int) -> None:
