@@ -129,9 +129,11 @@ def test_a_link_left_by_a_killed_fake_is_replaced(tmp_path: Path) -> None:
     with forked.start(command, stdout=subprocess.PIPE, cwd=ROOT, env=environment) as process:
         assert process.stdout is not None
         process.stdout.readline()
-        with pytest.raises(LinkError, match="arm is the link of a fake that is still running; stop it or choose"):
-            PtyServer(load_fake(CONFIG), link)
-        process.kill()
+        try:
+            with pytest.raises(LinkError, match="arm is the link of a fake that is still running; stop it or choose"):
+                PtyServer(load_fake(CONFIG), link)
+        finally:
+            process.kill()
     assert link.is_symlink()
     with PtyServer(load_fake(CONFIG), link) as server:
         assert str(link.readlink()) == server.path
