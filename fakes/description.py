@@ -134,6 +134,8 @@ class FakeArm(Described):
     moves: Annotated[
         tuple[Move, ...], Field(strict=False, description="movements by hand of joints whose torque is off")
     ] = ()
+    _folder: Path | None = None
+    """Folder of the TOML file, where the module of a custom plant may be."""
 
     @model_validator(mode="after")
     def _a_servo_for_each_joint(self) -> Self:
@@ -174,7 +176,7 @@ class FakeArm(Described):
         if self.chain is not None:
             return make_chain(self.chain)
         name = self.plant or ""
-        plant = load_plant(name, self.plant_options)
+        plant = load_plant(name, self.plant_options, self._folder)
         count = max(self.joints) + 1
         if plant.joints != count:
             servos = f"{len(self.servos)} servos" + (f" on {count}" if count != len(self.servos) else "")
@@ -221,9 +223,12 @@ def load_fake(path: Path | str) -> FakeArm:
     if not isinstance(table, dict):
         raise DescriptionError(f"{path} has no [fake] table, so there is no fake arm to open")
     try:
-        return FakeArm.model_validate(beside(table, Path(path).parent))
+        fake = FakeArm.model_validate(beside(table, path.parent))
     except ValidationError as error:
         raise DescriptionError(describe(error, path, FakeArm, "fake")) from error
+    if fake.plant is not None:
+        fake._folder = path.resolve().parent
+    return fake
 
 
 def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:

@@ -8,9 +8,11 @@ import contextlib
 import ctypes
 import fcntl
 import gc
+import hashlib
 import os
 import pty
 import select
+import socket
 import struct
 import time
 import tty
@@ -37,6 +39,7 @@ LONGEST_SLEEP_S = 0.05
 PRIORITY = 10
 """Priority under SCHED_FIFO, if permitted: below that of a control loop on the same computer."""
 
+_TERMINALS = Path("/dev/pts")
 _TCGETS2 = 0x802C542A
 _PR_SET_TIMERSLACK = 29
 _CHUNK = 4096
@@ -75,7 +78,8 @@ class Counts(NamedTuple):
 class PtyServer:
     """Serves one fake arm on a pseudo-terminal; `serve` runs until `stop` is called from a thread or signal handler.
 
-    link: symbolic link to create for the terminal; raises LinkError if the path already exists.
+    link: symbolic link to create for the terminal. A link that a killed server left is replaced; LinkError is raised if
+    anything else has that path, or a running server that link.
     `bus` may be inspected, and its hand moved, from another thread that holds `lock`; from another process, `hil
     hand` moves it.
     """
@@ -88,13 +92,11 @@ class PtyServer:
         self._link = link
         self._master = self._slave = -1
         self._hand: HandSocket | None = None
+        self._claim = None if link is None else _claim(link)
         self._wake_read, self._wake_write = os.pipe()
         self._stopped = False
         self._overruns = 0
         self._late_max_s = 0.0
-        if link is not None and (link.exists() or link.is_symlink()):
-            self._close_wake()
-            raise LinkError(f"{link} already exists; remove it or choose another --link")
         self._plug_in()
 
     def __enter__(self) -> "PtyServer":
@@ -163,6 +165,8 @@ class PtyServer:
         """Remove the terminal and the link. May be called twice."""
         self._unplug()
         self._close_wake()
+        if self._claim is not None:
+            self._claim.close()
 
     def _take(self) -> None:
         try:
@@ -229,6 +233,31 @@ class PtyServer:
             if descriptor >= 0:
                 os.close(descriptor)
         self._wake_read = self._wake_write = -1
+
+
+def _claim(link: Path) -> socket.socket:
+    """Claim a link until the socket is closed or the process dies, and remove it if a server that was killed left it.
+
+    The claim is an abstract Unix socket, which the system frees. Raises LinkError if the link cannot be used.
+    """
+    path = os.fsencode(link.parent.resolve() / link.name)
+    claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        claim.bind(b"\0hil-fake-link:" + hashlib.sha256(path).hexdigest().encode())  # a name has at most 107 bytes
+    except OSError:
+        claim.close()
+        raise LinkError(
+            f"{link} is the link of a fake that is still running; stop it or choose another --link"
+        ) from None
+    try:
+        if link.is_symlink() and (not link.exists() or link.resolve().parent == _TERMINALS):
+            link.unlink()
+        elif link.exists():
+            raise LinkError(f"{link} already exists; remove it or choose another --link")
+    except OSError:
+        claim.close()
+        raise
+    return claim
 
 
 def _baud_of(master: int) -> int:

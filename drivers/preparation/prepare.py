@@ -117,7 +117,8 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     if drive_mode & ~TIME_BASED_PROFILE:
         raise WrongSetting(
             f"{joint.title}: Drive Mode is {drive_mode} but must be 0 (no reverse, no torque on by goal "
-            "update). Set it with DYNAMIXEL Wizard 2.0; use `direction = -1` for a joint that turns the other way."
+            "update). Set it with DYNAMIXEL Wizard 2.0; if it reversed the servo, determine `direction` and zero_ticks "
+            "again."
         )
     secondary = servo.read("Secondary(Shadow) ID")
     if secondary in others:

@@ -10,7 +10,9 @@ A custom plant is any object with the members of `Plant`, created by a function 
 
 import importlib
 import math
+import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from hil.fakes.plants.arm import Arm
@@ -103,10 +105,14 @@ def allow_code(allowed: bool = True) -> None:
     _leave["code"] = allowed
 
 
-def load_plant(name: str, options: Mapping[str, object]) -> Plant:
+_searched: list[str] = []
+"""Folders added to sys.path because a TOML file in them names a plant."""
+
+
+def load_plant(name: str, options: Mapping[str, object], folder: Path | None = None) -> Plant:
     """Create a plant by calling `module:factory` with these options; raises PlantError.
 
-    Factories outside `OWN_PLANTS` require `allow_code`.
+    Factories outside `OWN_PLANTS` require `allow_code`. folder: where else to look for the module.
     """
     if name not in OWN_PLANTS and not _leave["code"]:
         raise PlantError(
@@ -116,10 +122,19 @@ def load_plant(name: str, options: Mapping[str, object]) -> Plant:
             f"{' and '.join(sorted(OWN_PLANTS))} are allowed"
         )
     module_name, _, factory_name = name.partition(":")
+    if folder is not None and str(folder) not in sys.path:
+        sys.path.append(str(folder))
+        _searched.append(str(folder))
     try:
-        factory = getattr(importlib.import_module(module_name), factory_name)
+        module = importlib.import_module(module_name)
+        factory = getattr(module, factory_name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise PlantError(f'plant = "{name}": {error}; give "module:factory" with an importable module') from error
+        where = "" if folder is None else f", or one in {folder}"
+        text = f'plant = "{name}": {error}; give "module:factory" with an importable module{where}'
+        raise PlantError(text) from error
+    found = Path(getattr(module, "__file__", None) or "")
+    if folder and folder != found.parent and str(found.parent) in _searched and (folder / found.name).is_file():
+        raise PlantError(f'plant = "{name}" is that of {found} in this process, not that in {folder}; rename one')
     try:
         plant = factory(**options)
     except PlantError:

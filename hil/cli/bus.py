@@ -121,7 +121,10 @@ def setup(
     new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252, help="ID to set.")] = None,
     new_baud: Annotated[int | None, typer.Option("--new-baud", help="Baud rate to set.")] = None,
     return_delay_us: Annotated[
-        int | None, typer.Option("--return-delay-us", min=0, max=508, help="Return delay to set; recommended: 0.")
+        int | None,
+        typer.Option(
+            "--return-delay-us", min=0, max=508, help="Return delay to set, an even number of us; recommended: 0."
+        ),
     ] = None,
     secondary_id: Annotated[
         int | None,
@@ -137,12 +140,14 @@ def setup(
     from hil.cli.views.setup_view import changed, print_changes
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
-    from hil.setup.servo_settings import open_servo, set_up
+    from hil.setup.servo_settings import RETURN_DELAY_UNIT_US, open_servo, set_up
     from hil.setup.session.killed_run import recover
 
     for each in (baud, new_baud):
         if each is not None:
             _check_baud(each)
+    if return_delay_us is not None and return_delay_us % RETURN_DELAY_UNIT_US:
+        raise typer.BadParameter(f"--return-delay-us {return_delay_us}: servos take even values from 0 to 508 only.")
     if json_only and not yes:
         raise typer.BadParameter("--json cannot ask for confirmation: add --yes.")
     opened = open_port(port_url(port), baud)

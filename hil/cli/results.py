@@ -69,14 +69,22 @@ def export(
         print(f"{len(drawn.models)} arms in {folder}")
         return
     from hil.export.formats import export
+    from hil.export.source import MissingPackages
 
     if out is not None and len(formats) > 1:
         raise typer.BadParameter("--out names a single file: give exactly one --format.")
+    needs: list[str] = []
     for name in formats:
-        written = export(run, name, out, link_length)
+        try:
+            written = export(run, name, out, link_length)
+        except MissingPackages as error:
+            needs += error.needs
+            continue
         print(f"{written.path}")
         for missing in written.left_out:
             print(f"  {name.upper()} cannot represent {missing}")
+    if needs:
+        raise MissingPackages(*needs)
 
 
 def write_report(run: Path, out: Path | None = None) -> Path:

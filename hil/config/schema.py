@@ -37,7 +37,7 @@ from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode
 from hil.errors import ConfigError
 from hil.estimator.excitation.harmonics import harmonics_within
 from hil.fakes.description import FakeArm, beside, found_beside
-from hil.fakes.names import arm_names, find_arm
+from hil.fakes.names import ARMS, arm_names, find_arm
 from hil.next_step import command
 from hil.toml_errors import describe
 from hil.toml_file import TomlFileError, load_toml, parse_toml, read_toml_text, shortened
@@ -433,8 +433,8 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
 def port_url(port: str) -> str:
     """The URL of a port.
 
-    `port` is a URL or device, which is returned unchanged; a TOML file or the name of a bundled one; or the name of a
-    fake arm. Raises ConfigError.
+    `port` is a URL or device, which is returned unchanged; a TOML file; or the name of a fake arm for other programs
+    (`koch`) or else of a bundled configuration. Raises ConfigError.
     """
     url = _url_of(port)
     fakes.register_for(url)
@@ -450,14 +450,21 @@ def _is_only_fake(path: Path) -> bool:
     return "fake" in values and "port" not in values and "joints" not in values
 
 
+def config_of(port: str) -> Path | None:
+    """The configuration that `port`, as given to `port_url`, means; None for a URL, a device or a fake arm."""
+    if "://" in port or find_arm(port).parent == ARMS:
+        return None
+    config = find_config(Path(port))
+    return config if (config.suffix == ".toml" or config.is_file()) and not _is_only_fake(config) else None
+
+
 def _url_of(port: str) -> str:
     if "://" in port:
         return port
-    config = find_config(Path(port))
-    if config.suffix == ".toml" or config.is_file():
-        return f"{FAKE_URL}{config}" if _is_only_fake(config) else load_config(config).url
+    if config := config_of(port):
+        return load_config(config).url
     arm = find_arm(port)
-    if arm.suffix == ".toml":
+    if arm.suffix == ".toml" or arm.is_file():
         return f"{FAKE_URL}{arm}"
     close = get_close_matches(port, [*arm_names(), *bundled_configs()], 1, 0.8)
     if close and not Path(port).exists():

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hil import __version__
-from hil.errors import ExportError, RunFolderError
+from hil.errors import RunFolderError
 from hil.estimator.arrays import Array
 from hil.export.columns import COLUMN_UNITS
 from hil.export.foxglove import (
@@ -23,7 +23,7 @@ from hil.export.foxglove import (
     transforms_schema,
 )
 from hil.export.moving_scene import moving_scene
-from hil.export.source import Recorded
+from hil.export.source import MissingPackages, Recorded
 
 __all__ = ["export_mcap"]
 
@@ -43,7 +43,7 @@ def export_mcap(source: Recorded, path: Path) -> list[str]:
     try:
         from mcap.writer import CompressionType, Writer
     except ImportError as error:
-        raise ExportError("MCAP needs the package mcap: pip install 'hil[export]'.") from error
+        raise MissingPackages("MCAP needs the package mcap") from error
     try:
         with path.open("wb") as file:
             writer: Any = Writer(file, compression=CompressionType.ZSTD)

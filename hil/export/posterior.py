@@ -18,7 +18,7 @@ from hil.errors import ExportError, RunFolderError
 from hil.estimator.arrays import Array
 from hil.estimator.models.terms import kind_of
 from hil.export.mjcf import export_mjcf
-from hil.export.source import Source
+from hil.export.source import MissingPackages, Source
 from hil.export.urdf import export_urdf
 
 FORMATS = {"mjcf": (export_mjcf, "xml"), "urdf": (export_urdf, "urdf")}
@@ -92,7 +92,7 @@ def export_samples(
     except OSError as error:
         raise RunFolderError(f"{out} cannot be created: {error.strerror}.") from error
     _nothing_older(formats, out, samples)
-    for name in formats:
+    for name in sorted(formats, key="parquet".__eq__):  # last, as its package may be missing
         if name == "parquet":
             _write_table(source, drawn, out / TABLE)
             continue
@@ -202,7 +202,7 @@ def _write_table(source: Source, drawn: Drawn, path: Path) -> None:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError as error:
-        raise ExportError("Parquet needs the package pyarrow: pip install 'hil[export]'.") from error
+        raise MissingPackages("Parquet needs the package pyarrow") from error
     table: dict[str, Array] = {"torque_factor": drawn.torque_factor}
     units = {"torque_factor": "1"}
     for index, name in enumerate(drawn.names):

@@ -12,12 +12,20 @@ from numpy.typing import NDArray
 from hil import strict_json
 from hil.arm_model import ArmModel
 from hil.config.schema import Config
-from hil.errors import RunFolderError
+from hil.errors import ExportError, RunFolderError
 from hil.model_file import model_of, read_usable_result
 from hil.results.result import Result
 from hil.runs.run_folder import RunFolder
 
-__all__ = ["Recorded", "Source", "write_text"]
+__all__ = ["MissingPackages", "Recorded", "Source", "write_text"]
+
+
+class MissingPackages(ExportError):
+    """Packages that formats need are not installed. needs: one text per format."""
+
+    def __init__(self, *needs: str) -> None:
+        super().__init__(f"{', '.join(needs)}: pip install 'hil[export]'.")
+        self.needs = needs
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.errors import ExportError, RunFolderError
+from hil.errors import RunFolderError
 from hil.export.columns import columns, unit
-from hil.export.source import Recorded, write_text
+from hil.export.source import MissingPackages, Recorded, write_text
 from hil.model_file import model_of
 
 
@@ -32,7 +32,7 @@ def export_parquet(source: Recorded, path: Path) -> list[str]:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError as error:
-        raise ExportError("Parquet needs the package pyarrow: pip install 'hil[export]'.") from error
+        raise MissingPackages("Parquet needs the package pyarrow") from error
     table = columns(source)
     fields = [
         pa.field(name, pa.from_numpy_dtype(col.dtype), metadata={"unit": unit(name)}) for name, col in table.items()

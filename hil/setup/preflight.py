@@ -281,12 +281,15 @@ def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: S
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
 
 
-def _drive_mode(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+def _drive_mode(config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     drive_mode = servo.read("Drive Mode")
     fix = (
         "0 is needed: bit 0 reverses the servo (use `direction = -1` instead), and bit 3 lets any goal switch torque "
         "on. Set it with DYNAMIXEL Wizard 2.0."
     )
+    if drive_mode & 1:
+        how = "hil pose --guide" if config.is_chain else "hil init"
+        fix += f" Then `direction` and zero_ticks are no longer right: determine them again, with {how}."
     return _graded(not drive_mode & ~TIME_BASED_PROFILE, "drive mode", str(drive_mode), fix)
 
 

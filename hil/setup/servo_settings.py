@@ -21,12 +21,13 @@ _PING_ONLY = load_control_table("XM430-W350")
 
 
 class Change(NamedTuple):
-    """A register change: old and requested values, and whether it was written (and read back) or declined."""
+    """A register change: old and requested values in `unit`, and whether it was written (and read back) or declined."""
 
     register: str
     before: int
     after: int
     written: bool
+    unit: str = ""
 
 
 def open_servo(port: Port, servo_id: int) -> Servo:
@@ -77,12 +78,11 @@ def set_up(
 
 def _set_return_delay(servo: Servo, confirm: Confirm, delay_us: int) -> Change:
     name = "Return Delay Time"
-    before, after = servo.read(name), delay_us // RETURN_DELAY_UNIT_US
-    was = f"{before * RETURN_DELAY_UNIT_US} us"
-    written = before != after and confirm(f"{servo.title}: change {name} from {was} to {delay_us} us?")
+    before = servo.read(name) * RETURN_DELAY_UNIT_US
+    written = before != delay_us and confirm(f"{servo.title}: change {name} from {before} us to {delay_us} us?")
     if written:
-        servo.write(name, after)
-    return Change(name, before, after, written)
+        servo.write(name, delay_us // RETURN_DELAY_UNIT_US)
+    return Change(name, before, delay_us, written, "us")
 
 
 def _set_secondary_id(servo: Servo, confirm: Confirm, secondary: int) -> Change:
@@ -127,7 +127,7 @@ def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
         f"{servo.title}: change its baud rate from {former} to {baud}? All servos on a bus must use the same one."
     )
     if before == after:
-        return Change(name, before, after, False)
+        return Change(name, baud, baud, False, "baud")
     # First check that the adapter supports this rate: otherwise the servo would become unreachable.
     port.set_baud(baud)
     try:
@@ -140,13 +140,13 @@ def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
             "one of them another ID first."
         )
     if not confirm(question):
-        return Change(name, before, after, False)
+        return Change(name, former, baud, False, "baud")
     for _ in range(_ATTEMPTS):
         _write_blind(servo, name, after)
         port.set_baud(baud)
         if _answers(servo):
             _verify(servo, name, after)
-            return Change(name, before, after, True)
+            return Change(name, former, baud, True, "baud")
         port.set_baud(former)
         if not _answers(servo):
             raise NoReply(

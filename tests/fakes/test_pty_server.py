@@ -122,6 +122,39 @@ def test_a_link_that_exists_or_cannot_be_made(tmp_path: Path) -> None:
     assert len(os.listdir("/proc/self/fd")) == descriptors  # noqa: PTH208
 
 
+def test_a_link_left_by_a_killed_fake_is_replaced(tmp_path: Path) -> None:
+    link = tmp_path / "arm"
+    command = ["hil", "fake", str(CONFIG), "--pty", "--link", str(link)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with forked.start(command, stdout=subprocess.PIPE, cwd=ROOT, env=environment) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        try:
+            with pytest.raises(LinkError, match="arm is the link of a fake that is still running; stop it or choose"):
+                PtyServer(load_fake(CONFIG), link)
+        finally:
+            process.kill()
+    assert link.is_symlink()
+    with PtyServer(load_fake(CONFIG), link) as server:
+        assert str(link.readlink()) == server.path
+
+
+def test_a_link_that_points_to_a_terminal_or_to_nothing_is_replaced_and_no_other(tmp_path: Path) -> None:
+    link, file = tmp_path / "arm", tmp_path / "file"
+    file.write_text("mine")
+    with PtyServer(load_fake(CONFIG)) as other:
+        for target in (other.path, "/dev/pts/999999"):
+            link.symlink_to(target)
+            with PtyServer(load_fake(CONFIG), link) as server:
+                assert str(link.readlink()) == server.path
+    for target in (str(file), "/dev/null"):
+        link.symlink_to(target)
+        with pytest.raises(LinkError, match="arm already exists; remove it or choose another"):
+            PtyServer(load_fake(CONFIG), link)
+        assert str(link.readlink()) == target
+        link.unlink()
+
+
 def used_until_hung_up(port: serial.Serial) -> None:
     with pytest.raises((OSError, serial.SerialException)):
         for _ in range(1000):

@@ -8,6 +8,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from hil.config.schema import config_of
 from hil.next_step import next_step
 from hil.printing import print_fitting, result_console, say, say_behind
 from hil.setup.preflight import Finding, Level
@@ -64,7 +65,7 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
 
 def _after_scan(servos: Sequence[Found], port: str) -> str:
     """Return the next command: set all servos to one baud rate if necessary, otherwise describe or check the arm."""
-    if Path(port).is_file() or not ("/" in port or ":" in port or port.upper().startswith("COM")):
+    if config_of(port):
         return next_step("check", port)
     if len({servo.baud for servo in servos}) > 1:
         other = min(servos, key=lambda servo: servo.baud)
@@ -109,10 +110,11 @@ def print_changes(changes: Sequence[Change], port: str) -> None:
     if not changes:
         print("Nothing to change: give --new-id, --new-baud, --return-delay-us or --secondary-id.")
     for change in changes:
+        before, after = (f"{value} {change.unit}".rstrip() for value in (change.before, change.after))
         if change.written:
-            print(f"{change.register}: {change.before} -> {change.after}, read back.")
-        elif change.before == change.after:
-            print(f"{change.register} is already {change.after}.")
+            print(f"{change.register}: {before} -> {after}, read back.")
+        elif before == after:
+            print(f"{change.register} is already {after}.")
         else:
-            print(f"{change.register}: left at {change.before}.")
+            print(f"{change.register}: left at {before}.")
     print(next_step("scan", port))

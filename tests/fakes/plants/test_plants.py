@@ -215,6 +215,29 @@ def test_another_plant() -> None:
     assert base_parameters(described("plants_of_others:Good").arm) == {}
 
 
+def test_the_module_of_a_plant_may_be_beside_the_toml_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    servo = '[[fake.servos]]\nid = 1\nmodel = "XM430-W350"\nzero_ticks = 0\n'
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        text = f'[fake]\nplant = "plant_of_this_test:Good"\nplant_options = {{ speed = 2.0 }}\n{servo}'
+        (tmp_path / name / "arm.toml").write_text(text, encoding="utf-8")
+    first, second = (tmp_path / name / "arm.toml" for name in ("first", "second"))
+    with pytest.raises(PlantError, match=f"No module named 'plant_of_this_test'; .*, or one in {first.parent}$"):
+        make_bus(load_fake(first), VirtualClock())
+    for file in (first, second):
+        (file.parent / "plant_of_this_test.py").write_text("from plants_of_others import Good\n", encoding="utf-8")
+    bus = make_bus(load_fake(first).model_copy(update={"seed": 3}), VirtualClock())
+    bus.advance(1.5)
+    assert bus.plant.position == [3.0]
+    with pytest.raises(PlantError, match=f"is that of {first.parent}/.* not that in {second.parent}; rename one$"):
+        make_bus(load_fake(second), VirtualClock())
+    monkeypatch.delitem(sys.modules, "plant_of_this_test")
+    fakes.allow_code(False)
+    with pytest.raises(PlantError, match="--allow-code"):
+        make_bus(load_fake(first), VirtualClock())
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [

@@ -6,6 +6,7 @@ import logging
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -269,6 +270,10 @@ def test_a_loaded_run_equals_itself_and_its_result_every_copy(identified_once: P
     first, second = hil.load_run(identified_once), hil.load_run(identified_once)
     assert first in [first] and first != second and len({first, second}) == 2 and first.result == second.result
     assert [each.path for each in find_runs(str(identified_once))] == [identified_once]
+    result = first.result
+    assert result is not None and result.timing.estimation_seconds != 99.0
+    for changes, same in (({"estimation_seconds": 99.0}, True), ({"lost_replies": 99}, False)):
+        assert (replace(result, timing=replace(result.timing, **changes)) == result) == same
 
 
 def test_check_says_that_the_pilot_takes_precedence_over_a_torque() -> None:

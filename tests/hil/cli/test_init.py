@@ -4,6 +4,7 @@ import io
 import math
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -152,6 +153,26 @@ def test_a_bus_that_makes_no_arm_is_said(arm_file: ArmFile) -> None:
                 interview(port, url, heard, lambda _, usual: usual, lambda _: None)
     finally:
         port.close()
+
+
+@pytest.mark.parametrize("mode", [1, 4, 8])
+def test_a_drive_mode_that_check_refuses_is_said_before_anything_is_measured(arm_file: ArmFile, mode: int) -> None:
+    """Directions and zeros measured on a reversed servo are wrong once its Drive Mode is 0."""
+    servo = "[[fake.servos]]\nid = 2\n"
+    port = open_port(port_url(str(arm_file((servo, f'{servo}registers = {{ "Drive Mode" = {mode} }}\n')))), 1_000_000)
+    asked: list[str] = []
+
+    def ask(question: str, usual: str) -> str:
+        asked.append(question.split(" ", 1)[0])
+        return usual
+
+    refused = pytest.raises(ExperimentError, match=rf"ID 2.*: {mode}\). Set it to 0 .* run the same command again")
+    try:
+        with nullcontext() if mode == 4 else refused:
+            interview(port, "fake://", list(scan(port, (1_000_000,))), ask, lambda _: None)
+    finally:
+        port.close()
+    assert mode == 4 or asked == ["IDs"]
 
 
 @pytest.mark.parametrize("model", SERVO_MODELS)

@@ -54,6 +54,23 @@ def test_a_run_that_is_not_whole_is_one_message_and_code_2(
     assert hil(*command, tmp_path / "nowhere") == 2
 
 
+def test_what_can_be_exported_is_although_packages_are_missing(
+    identified: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for package in ("pyarrow", "mcap", "mcap.writer"):
+        monkeypatch.setitem(sys.modules, package, None)
+    formats = ("parquet", "csv", "mcap", "json")
+    assert hil("export", identified, *(word for name in formats for word in ("--format", name))) == 2
+    printed = capsys.readouterr()
+    for name in ("csv", "json"):
+        assert any(line.endswith(f".{name}") and Path(line).is_file() for line in printed.out.splitlines())
+    needed = "Parquet needs the package pyarrow, MCAP needs the package mcap: pip install 'hil[export]'."
+    assert printed.err == f"hil: {needed}\n"
+    drawn = ("--samples", 2, "--out", tmp_path, "--format", "parquet", "--format", "mjcf")
+    assert hil("export", identified, *drawn) == 2
+    assert (tmp_path / "arm_0001.xml").is_file()
+
+
 def test_arguments_that_do_not_go_together(identified: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert hil("export", identified, "--format", "toml", "--format", "json", "--out", "x") == 2
     assert "--out names a single file" in capsys.readouterr().err

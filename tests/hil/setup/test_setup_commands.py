@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from hil import fakes
 from hil.cli.app import app
+from hil.cli.views.setup_view import print_scan
 from hil.config.schema import Config, load_config
 from hil.drivers.errors import NoReply, PortLost, WrongSetting
 from hil.drivers.port import Port, open_port
@@ -21,7 +22,7 @@ from hil.fakes.description import load_fake
 from hil.fakes.protocol_fake import open_fake
 from hil.setup import preflight
 from hil.setup.preflight import Finding, Level, check_arm
-from hil.setup.scan import Asking, listen, scan
+from hil.setup.scan import Asking, Found, Heard, listen, scan
 from hil.setup.servo_settings import open_servo, set_up
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
@@ -114,6 +115,27 @@ def test_scan_command(arm_file: ArmFile) -> None:
     assert "No servo answered" in result.stdout
 
 
+@pytest.mark.parametrize(
+    ("port", "command"),
+    [
+        ("arm9", "init arm9 --out my_arm.toml"),
+        ("COM3", "init COM3 --out my_arm.toml"),
+        ("/dev/ttyUSB0", "init /dev/ttyUSB0 --out my_arm.toml"),
+        ("only_fake.toml", "init only_fake.toml --out my_arm.toml"),
+        ("xm430_two_link", "check xm430_two_link"),
+        ("arm.toml", "check arm.toml"),
+    ],
+)
+def test_after_a_scan_a_device_is_described_and_a_configuration_checked(
+    port: str, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("arm9").symlink_to("/dev/null")
+    Path("only_fake.toml").write_text("[fake]\n", encoding="utf-8")
+    print_scan([Heard(1_000_000, (Found(1_000_000, 1, 1020, "XM430-W350", 48, 12.0, 35.0, ""),), "")], port)
+    assert capsys.readouterr().out.splitlines()[-1] == f"Next: hil {command}"
+
+
 # check
 
 
@@ -161,6 +183,7 @@ def test_check_reports_a_path_that_a_run_would_refuse() -> None:
     [
         ((SERVO_2, SERVO_2 + "return_delay_us = 500\n"), "return delay", Level.WARNING, "--return-delay-us 0"),
         ((SERVO_2, SERVO_2 + 'registers = { "Drive Mode" = 8 }\n'), "drive mode", Level.STOP, "torque on"),
+        ((SERVO_2, SERVO_2 + 'registers = { "Drive Mode" = 1 }\n'), "drive mode", Level.STOP, "again, with hil init"),
         ((SERVO_2, SERVO_2 + 'registers = { "Current Limit" = 100 }\n'), "current limit", Level.STOP, "is 0.8 A"),
         ((SERVO_2, SERVO_2 + 'registers = { "Shutdown" = 0 }\n'), "shuts down on", Level.WARNING, "factory value"),
         ((SERVO_2, SERVO_2 + "temperature_c = 79.0\n"), "temperature", Level.WARNING, "cool down"),
@@ -316,6 +339,22 @@ def test_setup_command_asks(arm_file: ArmFile) -> None:
     assert json.loads(invoke(*words, "--yes", "--json").stdout)["changes"][0]["written"] is True
     assert invoke(*words, "--json").exit_code == 2
     assert invoke("setup", arm_file(), "--id", 2, "--new-baud", 12345).exit_code == 2
+
+
+def test_setup_reports_the_units_that_it_asks_in(arm_file: ArmFile) -> None:
+    words = ("setup", arm_file(), "--id", 2, "--yes")
+    assert "Return Delay Time: 0 us -> 20 us, read back" in invoke(*words, "--return-delay-us", 20).stdout
+    assert "Return Delay Time is already 0 us." in invoke(*words, "--return-delay-us", 0).stdout
+    assert "Baud Rate: 1000000 baud -> 57600 baud, read back" in invoke(*words, "--new-baud", 57_600).stdout
+    assert json.loads(invoke(*words, "--return-delay-us", 20, "--json").stdout)["changes"] == [
+        {"register": "Return Delay Time", "before": 0, "after": 20, "written": True, "unit": "us"}
+    ]
+
+
+def test_an_odd_return_delay_is_refused(arm_file: ArmFile) -> None:
+    result = invoke("setup", arm_file(), "--id", 2, "--yes", "--return-delay-us", 3)
+    assert result.exit_code == 2
+    assert "--return-delay-us 3: servos take even values from 0 to 508 only." in " ".join(result.output.split())
 
 
 @pytest.mark.parametrize("kind", ["lost_reply", "corrupted_reply", "lost_instruction", "truncated_reply"])
