@@ -16,8 +16,11 @@ from hil.config.schema import load_config
 from tests.support.packages import build, unpack
 from tests.support.paths import ROOT
 
-MOST_CODE_BYTES = 1_080_000
-"""Upper bound for the modules, compressed, without the archive's directory, which grows with their number [bytes]."""
+MOST_CODE_BYTES = 1_090_000
+"""Upper bound for the modules, compressed, without the archive's directory, which grows with their number [bytes].
+
+It is raised deliberately, when features need it, not when something has slipped into the wheel.
+"""
 
 MOST_DATA_BYTES = 60_000
 """Upper bound for configurations, templates and tables: recordings, runs or pictures would exceed it [bytes]."""
