@@ -20,7 +20,7 @@ from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble, prior_ensemble
 from hil.errors import Cause, SafetyStop
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled, embedded, only_version
+from hil.estimator.compiled import compiled, inner, only_version
 from hil.estimator.models.momentum_observer import NAMES, MomentumObserver, observe
 from hil.estimator.models.parameters import CONSTANTS
 from hil.estimator.models.standstill import WITHIN_RAD
@@ -147,7 +147,7 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
     return found
 
 
-_jolting = embedded(_jolting)
+_jolting = inner(_jolting)
 
 
 _TIMES = np.dtype(
