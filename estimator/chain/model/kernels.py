@@ -15,12 +15,12 @@ Every formula is linear in the inertial parameters, so base parameters, with all
 """
 
 import math
+from functools import partial
 from typing import Any
 
-import numba
 import numpy as np
 
-from hil.estimator.compiled import compiled
+from hil.estimator.compiled import compiled, embedded
 
 # Rows of the array `motion` by joint, six numbers each.
 AXIS, VELOCITY, ACCELERATION, SWEPT, CARRIED, CARRIED_AGAIN = range(6)
@@ -360,9 +360,10 @@ def invert(matrix: Any, inverse: Any, factor: Any) -> bool:  # noqa: PLR0912
 
 # Functions called only from compiled code need no wrappers for C. The large ones are part of several loops and cached,
 # so that a program that needs another of these loops later does not compile them again.
-_PLAIN: dict[str, Any] = {"fastmath": {"contract"}, "_nrt": False, "no_cfunc_wrapper": True}
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, **_PLAIN)
+_PLAIN: dict[str, Any] = {"fastmath": {"contract"}, "_nrt": False}
+_inner = partial(embedded, **_PLAIN)
 _cross, _dot, _push, _carry, _flow, _into = map(_inner, (_cross, _dot, _push, _carry, _flow, _into))
 place, move, accelerate, differentiate, regress, pull, invert = (
-    compiled(each, **_PLAIN) for each in (place, move, accelerate, differentiate, regress, pull, invert)
+    compiled(each, no_cfunc_wrapper=True, **_PLAIN)
+    for each in (place, move, accelerate, differentiate, regress, pull, invert)
 )
