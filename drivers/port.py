@@ -327,7 +327,8 @@ class DescriptorPort(Port):
         self._forget_descriptor()
         with contextlib.suppress(*_FAILURES):
             self._serial.close()
-        device = self.url if is_pseudo_terminal(self.url) else device_of(self._adapter)
+        is_pty = not self._adapter and is_pseudo_terminal(self.url)
+        device = self.url if is_pty else device_of(self._adapter)
         if device is None:
             return False
         try:

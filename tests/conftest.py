@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import serial
+from hypothesis import HealthCheck, settings
 from threadpoolctl import threadpool_limits
 
 from benchmarks.spatial.remembered import remembered
@@ -20,6 +21,12 @@ from hil.plan import chain_plan, plan
 from hil.runs.run_folder import RunFolder
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
+
+# The same examples in every run, however busy the machine is. Fixtures used with @given only build what may be shared.
+settings.register_profile(
+    "repeatable", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+settings.load_profile("repeatable")
 
 
 @pytest.hookimpl(trylast=True)  # once deselected tests are gone

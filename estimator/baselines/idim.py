@@ -7,7 +7,7 @@ Control Engineering Practice 9 (2001) 1361; Swevers, Verdonck, De Schutter, "Dyn
 robots", IEEE Control Systems 27 (2007) 58.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -64,12 +64,17 @@ def uniform(recording: Recording, delay: float = 0.0) -> tuple[Array, Array, flo
     return position, recording.mean_torque(edges, delay), dt
 
 
+MoreColumns = Callable[[Array], Array]
+"""Further columns of the regressor (joints, samples, columns) as a function of the positions (joints, samples)."""
+
+
 def filtered_rows(
     recording: Recording,
     cutoff: float,
     coulomb_width: float,
     delay: float = 0.0,
     position_cutoff: float | None = None,
+    more: MoreColumns | None = None,
 ) -> Rows:
     """Return the rows of the regression; arguments as in `fit_inverse_dynamics`.
 
@@ -86,10 +91,14 @@ def filtered_rows(
         )
     from scipy.signal import butter, sosfiltfilt
 
-    tau = sosfiltfilt(butter(ORDER, cutoff, fs=1.0 / dt, output="sos"), torque, axis=1)
+    filter_ = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
+    tau = sosfiltfilt(filter_, torque, axis=1)
     # As bytes, which are compared in an instant: arrays have no hash.
     given = position.tobytes(), position.shape[0], dt, cutoff, position_cutoff or cutoff, coulomb_width
-    return Rows(_filtered_regressor(*given, trim, keep), tau[:, trim:-trim:keep])
+    Y = _filtered_regressor(*given, trim, keep)
+    if more is not None:
+        Y = np.concatenate((Y, sosfiltfilt(filter_, more(position), axis=1)[:, trim:-trim:keep]), axis=2)
+    return Rows(Y, tau[:, trim:-trim:keep])
 
 
 @lru_cache(maxsize=4)  # the search for faults tries hundreds of torques with the same positions
@@ -121,6 +130,7 @@ def fit_inverse_dynamics(
     coulomb_width: float,
     delay: float = 0.0,
     position_cutoff: float | None = None,
+    more: MoreColumns | None = None,
 ) -> InverseDynamics:
     """Fit all `recordings` by IDIM-LS, weighting each joint according to its torque residual in the previous solution.
 
@@ -128,9 +138,10 @@ def fit_inverse_dynamics(
     coulomb_width: width of the smoothed Coulomb step [rad/s].
     delay: delay of the torque [s].
     position_cutoff: cut-off frequency for the positions from which regressors are computed [Hz]; by default `cutoff`.
+    more: further columns of the regressor; their coefficients follow the base parameters, without names.
     Raises RecordingError, UnidentifiableError.
     """
-    rows = [filtered_rows(recording, cutoff, coulomb_width, delay, position_cutoff) for recording in recordings]
+    rows = [filtered_rows(recording, cutoff, coulomb_width, delay, position_cutoff, more) for recording in recordings]
     Y = np.concatenate([row.regressor for row in rows], axis=1)
     tau = np.concatenate([row.torque for row in rows], axis=1)
     weight = np.ones(len(Y))

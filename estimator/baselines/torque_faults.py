@@ -1,23 +1,27 @@
 """Detection of motor torques that differ from the torque column: clipped by the drive, timestamped by a different
-clock, or delayed on one joint.
+clock, or delayed on one joint; and of stops that add a torque of their own.
 
 As in the detection of reversed columns (`hil.estimator.baselines.signs`), the residual of inverse dynamics for the
 torque as given is compared with that for a modified torque.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.baselines.idim import fit_inverse_dynamics
+from hil.estimator.baselines.idim import InverseDynamics, MoreColumns, fit_inverse_dynamics
 from hil.estimator.baselines.signs import COULOMB_WIDTH, CUTOFF, LESS_RESIDUAL
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 
 BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
 """Clipping levels to try, each given as the fraction of samples that exceed it."""
+OUTERMOST = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4])
+"""Places of a stop to try, each given as the fraction of samples beyond it."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
 LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
@@ -39,6 +43,22 @@ class Clipped:
     joint: int
     level: float
     beyond: float
+    residual: float
+    residual_given: float
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A yielding stop or object that a joint seems to press against beyond the angle `at` [rad].
+
+    side: 1 if it is touched at larger angles, -1 at smaller ones. stiffness: N m/rad. residual, residual_given:
+    relative RMS of the joint's torque residual, with the stop and without it.
+    """
+
+    joint: int
+    at: float
+    side: int
+    stiffness: float
     residual: float
     residual_given: float
 
@@ -109,6 +129,39 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
         if best is not None and best.residual < LESS_RESIDUAL * best.residual_given:
             found.append(best)
     return tuple(found)
+
+
+def suspect_stop(recordings: Sequence[Recording]) -> Stop | None:
+    """Return the stop that explains the motion much better than the torque alone, and better than springs."""
+    joints = recordings[0].joints
+    given, sprung = _residuals(recordings), _residuals(recordings, _springs)
+    if given is None or sprung is None:
+        return None
+    tried = []
+    for joint in range(joints):
+        angles = np.concatenate([each.filled()[joint] for each in recordings])
+        for side, beyond in itertools.product((1, -1), OUTERMOST.tolist()):
+            at = float(side * np.quantile(side * angles, 1.0 - beyond))
+            fitted = _fitted(recordings, partial(_pressing, joint, at, side))
+            if fitted is not None and fitted.value[-1] > 0.0:
+                left = float(fitted.relative_residual[joint])
+                tried.append(Stop(joint + 1, at, side, float(fitted.value[-1]), left, float(given[joint])))
+    best = min(tried, key=lambda each: each.residual / each.residual_given, default=None)
+    if best is None or best.residual > LESS_RESIDUAL * min(best.residual_given, float(sprung[best.joint - 1])):
+        return None
+    return best
+
+
+def _pressing(joint: int, at: float, side: int, positions: Array) -> Array:
+    """Return the column of a stop's stiffness (joints, samples, 1)."""
+    column = np.zeros((*positions.shape, 1))
+    column[joint, :, 0] = side * np.maximum(side * (positions[joint] - at), 0.0)
+    return column
+
+
+def _springs(positions: Array) -> Array:
+    """Return the columns of a spring on each joint (joints, samples, joints)."""
+    return positions[:, :, None] * np.eye(len(positions))[:, None, :]
 
 
 def suspect_late(recordings: Sequence[Recording]) -> Late | None:
@@ -199,9 +252,14 @@ def _shifted(recording: Recording, delay: float, relative: float) -> Recording:
     return replace(recording, torque=np.stack([np.interp(at, time, torque) for torque in recording.torque]))
 
 
-def _residuals(recordings: Sequence[Recording]) -> Array | None:
+def _residuals(recordings: Sequence[Recording], more: MoreColumns | None = None) -> Array | None:
     """Return the relative RMS of the torque residual (joints,); None if inverse dynamics cannot be solved."""
+    fitted = _fitted(recordings, more)
+    return None if fitted is None else fitted.relative_residual
+
+
+def _fitted(recordings: Sequence[Recording], more: MoreColumns | None) -> InverseDynamics | None:
     try:
-        return fit_inverse_dynamics(recordings, CUTOFF, COULOMB_WIDTH).relative_residual
+        return fit_inverse_dynamics(recordings, CUTOFF, COULOMB_WIDTH, more=more)
     except EstimationError:
         return None

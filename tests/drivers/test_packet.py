@@ -20,9 +20,6 @@ from hil.drivers.packet import (
 )
 from hil.drivers.sdk_port import ResyncingPacketHandler
 
-settings.register_profile("no deadline", deadline=None)  # a busy machine is not a failure
-settings.load_profile("no deadline")
-
 # Bytes in which headers and stuffing happen often.
 SPICY = st.lists(st.sampled_from([0xFF, 0xFF, 0xFD, 0x00, 0x01, 0x55]), max_size=40).map(bytes)
 BODIES = st.one_of(st.binary(max_size=60), SPICY)

@@ -3,17 +3,12 @@
 from collections.abc import Callable, Sequence
 
 import pytest
-from hypothesis import HealthCheck, settings
 
 from hil.drivers.packet import Framer, Instruction, Packet, encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import load_model
 from hil.fakes.servo.servo import EmulatedServo
-
-# A busy machine is not a failure; the fixtures used with @given only build benches, so they may be shared.
-settings.register_profile("no deadline", deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-settings.load_profile("no deadline")
 
 XM430 = load_model("XM430-W350")
 

@@ -9,7 +9,14 @@ from hil.estimation.unsettled.agreement import disagreement
 from hil.estimation.unsettled.defects import defect_said, is_certain, is_other_arm, likely_defect
 from hil.estimation.unsettled.local_defects import local_defects, local_residual
 from hil.estimator.arrays import Array
-from hil.estimator.baselines.torque_faults import suspect_clipped, suspect_drift, suspect_late, suspect_uneven
+from hil.estimator.baselines.torque_faults import (
+    Clipped,
+    suspect_clipped,
+    suspect_drift,
+    suspect_late,
+    suspect_stop,
+    suspect_uneven,
+)
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.selection.verdict import MUCH_LEFT
@@ -50,7 +57,7 @@ def causes(fitted: Fitted) -> tuple[str, ...]:
     if float(estimate.residual_over_noise.max()) <= MUCH_LEFT:
         return said
     where = recordings, names, fitted.predicted, estimate.segment_length
-    found = local_defects(*where) or _clipped(recordings) or _late(recordings) or _drifting(recordings)
+    found = local_defects(*where) or _stopped_or_clipped(recordings) or _late(recordings) or _drifting(recordings)
     return found or said or _uneven(recordings) or local_residual(*where)
 
 
@@ -60,14 +67,28 @@ def are_known(fitted: Fitted, found: tuple[str, ...]) -> bool:
     return bool(found) and found != local_residual(*where)
 
 
-def _clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
+def _stopped_or_clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Sentences about a stop or about clipped torques, whichever leaves less of the torque unexplained."""
+    stop, clipped = suspect_stop(recordings), suspect_clipped(recordings)
+    if stop is None or any(each.residual < stop.residual for each in clipped if each.joint == stop.joint):
+        return _clipped(recordings, clipped)
+    than = "above" if stop.side > 0 else "below"
+    return (
+        f"Joint {stop.joint} seems to press against something that yields, a stop, a cable or an object, {than} about "
+        f"{stop.at:.3g} rad: with a stiffness of {stop.stiffness:.2g} N m/rad there, inverse dynamics leaves "
+        f"{100 * stop.residual:.2g} % of the torque unexplained instead of {100 * stop.residual_given:.2g} %. Record "
+        "motion that stays clear of it.",
+    )
+
+
+def _clipped(recordings: Sequence[Recording], found: Sequence[Clipped]) -> tuple[str, ...]:
     return tuple(
         f"{_unsigned(recordings, each.joint)}The torque of joint {each.joint} seems to have been limited to about "
         f"{each.level:.3g} N m; its column exceeds that in {100 * each.beyond:.2g} % of the samples. With this limit, "
         f"inverse dynamics leaves {100 * each.residual:.2g} % of the torque unexplained instead of "
         f"{100 * each.residual_given:.2g} %. A "
         "current limit or the supply voltage clips it (saturation): use the measured current, or smaller commands."
-        for each in suspect_clipped(recordings)
+        for each in found
     )
 
 

@@ -13,7 +13,7 @@ import pytest
 from hil.estimation.unsettled import causes as looked_for
 from hil.estimation.unsettled.causes import Fitted, causes
 from hil.estimation.unsettled.warnings import doubts_of
-from hil.estimator.baselines.torque_faults import suspect_clipped
+from hil.estimator.baselines.torque_faults import suspect_clipped, suspect_stop
 from hil.estimator.data.recording import Recording
 from hil.estimator.selection.segment_verdict import relative_std
 from tests.support.recorded_motion import two_joints
@@ -96,6 +96,32 @@ def test_a_stop_is_named_with_its_angle() -> None:
     recording = Recording(time, np.stack((np.cos(time), np.sin(5.0 * time))), position, np.full(2, step), "held")
     (named,) = found(recording, position + 0.05 * np.sin(time))
     assert re.match(r"Joint 2 rebounds at 0\.(59|6)", named) and "and never moves past it" in named
+
+
+@pytest.mark.parametrize(("joint", "side"), [(0, 1), (0, -1), (1, 1), (1, -1)])
+def test_a_stop_that_yields_is_named_with_its_angle_and_stiffness(joint: int, side: int) -> None:
+    """The motor moves the arm as if nothing were there, so it also presses against the stop."""
+    recording = healthy()
+    angle, stiffness = side * recording.filled()[joint], 6.0 * float(np.abs(recording.torque[joint]).max())
+    at = float(np.quantile(angle, 0.85))
+    torque = recording.torque.copy()
+    torque[joint] += side * stiffness * np.maximum(angle - at, 0.0)
+    (named,) = found(replace(recording, torque=torque), recording.position + 1e-4)
+    where = re.match(
+        rf"Joint {joint + 1} seems to press .* (above|below) about (\S+) rad: with a stiffness of (\S+) N m/rad", named
+    )
+    assert where and where[1] == ("above" if side > 0 else "below")
+    assert float(where[2]) == pytest.approx(side * at, abs=0.1)
+    assert float(where[3]) == pytest.approx(stiffness, rel=0.4)
+
+
+@pytest.mark.parametrize("share", [0.5, 3.0])
+def test_a_spring_a_clipped_torque_and_a_healthy_arm_are_no_stop(share: float) -> None:
+    recording = healthy()
+    largest = np.abs(recording.torque).max(axis=1)[:, None]
+    sprung = replace(recording, torque=recording.torque + share * largest * recording.filled())
+    clipped = healthy(0.75)
+    assert [suspect_stop([each]) for each in (recording, sprung, clipped)] == [None] * 3
 
 
 def drifting(recording: Recording) -> Recording:
