@@ -31,16 +31,20 @@ settings.load_profile("repeatable")
 
 @pytest.hookimpl(trylast=True)  # once deselected tests are gone
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the tests that take a minute each, so that no worker is left with one at the end.
+    """Start with the tests that take a minute each, so that no worker is left with one at the end; then take files from
+    the first and the second half of the others in turn.
 
-    Of two workers, the first then compiles the loops of planar arms while the second compiles those of spatial arms,
-    and later each finds on disk what the other has compiled.
+    Of two workers that take whole files, each is then in another part of the code: what one of them compiles, the other
+    later finds on disk. Next to each other, both would compile the same loops at the same time.
     """
+    files = list(dict.fromkeys(item.path for item in items))
+    half = (len(files) + 1) // 2
+    turns = {path: 2 * (place % half) + place // half for place, path in enumerate(files)}
 
     def turn(item: pytest.Item) -> int:
         if item.get_closest_marker("long") is None:
-            return 2
-        return 1 if "chain" in item.nodeid else 0
+            return turns[item.path]
+        return -1 if "chain" in item.nodeid else -2
 
     items.sort(key=turn)
 
