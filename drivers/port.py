@@ -473,9 +473,9 @@ def _never_ready(_timeout_ms: float | None = None, /) -> list[tuple[int, int]]:
 
 def _why(error: BaseException, baud: int | None = None) -> str:
     """Return the reason for a failure, without the exception text's error numbers and repetitions."""
-    text = str(error.args[-1] if error.args else error)
-    if "fileno() method" in text:  # pyserial's port after a failed attempt to open it again
+    if isinstance(error, TypeError):  # see _PENDING_FAILURES
         return "it is closed"
+    text = str(error.args[-1] if error.args else error)
     of_device = "open port" in text or "configure port" in text
     for known, said in _REASONS.items():
         if of_device and known in text:

@@ -4,7 +4,7 @@ from typing import Literal, Self
 
 from pydantic import Field, PositiveFloat, field_validator, model_validator
 
-from hil.config.table import BusId, OneOrList, Range, Table
+from hil.config.table import BusId, OneOrList, Printable, Range, Table
 from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import SERVO_MODELS, Mode, servo_model, with_article
 
@@ -15,7 +15,7 @@ USUAL_TORQUE_SPREAD = 0.1
 class JointConfig(Table):
     """`[[joints]]`: one joint, from the base outwards."""
 
-    name: str = Field(min_length=1, max_length=20)
+    name: Printable = Field(min_length=1, max_length=20)
     servos: OneOrList[BusId] = Field(alias="id", description="bus ID, or the IDs of the joint's two servos")
     model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
     turns: OneOrList[Literal[-1, 1]] = Field(
@@ -35,14 +35,6 @@ class JointConfig(Table):
     velocity_limit: PositiveFloat = Field(description="rad/s")
     current_limit: PositiveFloat | None = Field(None, le=30, description="A")
     voltage_limit: PositiveFloat | None = Field(None, le=30, description="V, pwm mode only")
-
-    @field_validator("name")
-    @classmethod
-    def _printable(cls, name: str) -> str:
-        """Reject control characters, line breaks and surrogates: names appear in terminals, XML, HTML and CSV."""
-        if not name.isprintable():
-            raise ValueError("must not contain line breaks, tabs or other unprintable characters")
-        return name
 
     @field_validator("zero_ticks", mode="before")
     @classmethod

@@ -31,7 +31,7 @@ from hil.config.fake_url import FAKE_URL, url_from
 from hil.config.joint import JointConfig
 from hil.config.known_quantities import KnownConfig
 from hil.config.plausible import implausible
-from hil.config.table import Table, Turned
+from hil.config.table import Printable, Table, Turned
 from hil.drivers.bus import BusConfig
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode
 from hil.errors import ConfigError
@@ -65,18 +65,9 @@ SLOW_INTERVAL_S = 0.25
 class PortConfig(Table):
     """`[port]`: the bus to which the servos are connected."""
 
-    url: str = Field(
+    url: Printable = Field(
         min_length=1, description='device or pyserial URL; "fake://" opens the [fake] arm of the same file'
     )
-
-    @field_validator("url")
-    @classmethod
-    def _printable(cls, url: str) -> str:
-        """Reject control characters, which a terminal would obey."""
-        if not url.isprintable():
-            raise ValueError("must not contain line breaks, tabs or other unprintable characters")
-        return url
-
     baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
     one_write: bool = Field(True, description="send goals and read request in one write; set as hil check advises")
     fast_sync_read: bool = Field(True, description="use Fast Sync Read where every servo's firmware supports it")

@@ -2,7 +2,7 @@
 
 from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag
 
 from hil.fakes.plants.arm import PI
 from hil.toml_errors import UNSAID
@@ -13,6 +13,15 @@ class Table(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
+
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("must not contain line breaks, tabs or other unprintable characters")
+    return text
+
+
+Printable = Annotated[str, AfterValidator(_printable)]
+"""Text without control characters, line breaks and surrogates: it appears in terminals, XML, HTML and CSV."""
 
 BusId = Annotated[int, Field(ge=0, le=252)]
 _One = TypeVar("_One")

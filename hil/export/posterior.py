@@ -92,7 +92,7 @@ def export_samples(
     except OSError as error:
         raise RunFolderError(f"{out} cannot be created: {error.strerror}.") from error
     _nothing_older(formats, out, samples)
-    for name in sorted(formats, key="parquet".__eq__):  # last, as its package may be missing
+    for name in sorted(formats, key=lambda name: name == "parquet"):  # last, as its package may be missing
         if name == "parquet":
             _write_table(source, drawn, out / TABLE)
             continue
