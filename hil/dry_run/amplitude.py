@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.ensemble import Ensemble
-from hil.dry_run.prediction import GUARDED, Prediction, predict
+from hil.dry_run.prediction import GUARDED, UNITS, Prediction, predict
 from hil.errors import NoSafeTorque
 from hil.estimator.arrays import Array, Mask
 from hil.plan.plan import Plan, make_plan, scaled
@@ -118,9 +118,33 @@ def largest_amplitude(
             used = prediction.shares[:, :GUARDED].max(axis=(1, 2))
             worst = np.argsort(used)[-(int(config.safety.limit_chance * ensemble.size) + options.worst_arms) :]
         found = found * options.back_off
-    raise NoSafeTorque(
-        "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, add values "
-        "to [arm.prior], or raise safety.limit_chance."
+    smallest = scaled(config, base, found / options.back_off)
+    raise NoSafeTorque(_no_torque(config, smallest, ensemble, share, pose, executor))
+
+
+def _no_torque(
+    config: Config, plan: Plan, ensemble: Ensemble, share: float, pose: Array | None, executor: Executor | None
+) -> str:
+    """Describe which joint exceeds which limit in most of the simulated arms at the smallest torque that was tried."""
+    prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
+    exceeding = (prediction.shares[:, :GUARDED] >= share).sum(axis=0)
+    quantity, at = np.unravel_index(int(np.argmax(exceeding)), exceeding.shape)
+    joint = config.joints[at]
+    limit = ("lower position_limit", "upper position_limit", "velocity_limit")[quantity]
+    unit = UNITS[quantity]
+    torque = ", ".join(
+        f"{each.name!r} {peak:.2g} N m" for each, peak in zip(config.joints, plan.segments[0].peak_torque, strict=True)
+    )
+    part = f"{100 * share:.0f} % of the distance to " if share < 1.0 else ""
+    pilot = "omit [stabiliser] so that the pilot proposes one, "
+    return (
+        f"{config.path}: no torque was found that keeps the arm within its limits. Even with peak torques of {torque}, "
+        f"{exceeding[quantity, at]} of {ensemble.size} simulated arms exceed {part}the {limit} of joint "
+        f"{joint.name!r} ({prediction.limits[quantity, at]:.3g} {unit}). The probability of exceeding any limit is "
+        f"{100 * _chance(prediction, share):.2g} %; safety.limit_chance allows "
+        f"{100 * config.safety.limit_chance:.2g} %. Widen that limit, "
+        f"{pilot if config.experiment.pilot and config.stabiliser is not None else ''}add values to [arm.prior] so "
+        "that the simulated arms differ less, or raise safety.limit_chance."
     )
 
 

@@ -1,6 +1,7 @@
 """Dry runs: their predictions, the torque they allow, and the command."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -66,9 +67,24 @@ def test_too_much_torque_is_refused_by_the_worst_arms_alone(known: Config, monke
 
     monkeypatch.setattr(amplitude, "predict", never_safe)
     options = AmplitudeOptions(max_rounds=5)
-    with pytest.raises(NoSafeTorque):
+    with pytest.raises(NoSafeTorque, match=r"24 of 24 simulated arms exceed .* of the distance to the lower position_"):
         largest_amplitude(known, prior_ensemble(known, 24), options=options)
-    assert simulated == [24, *4 * [options.worst_arms]]
+    assert simulated == [24, *4 * [options.worst_arms], 24], "the last one is for the message"
+
+
+def test_a_refusal_names_joint_limit_and_a_stabiliser_that_is_given() -> None:
+    """An upright arm whose stabiliser is too soft for the heaviest of the arms falls at any torque."""
+    upright = replaced(
+        (CONFIGS / "fake_inverted.toml").read_text(),
+        KNOWN,
+        ("stiffness = [2.5, 1.2] ", "stiffness = [0.1, 0.1]"),
+        ("seed = 1\n", "seed = 1\npilot = true\nheld_out = false\n"),
+    )
+    config = parse_config(upright, CONFIGS / "fake_inverted.toml")
+    with pytest.raises(NoSafeTorque) as refused:
+        largest_amplitude(config, prior_ensemble(config, 8), options=AmplitudeOptions(max_rounds=2))
+    assert re.search(r"of 8 simulated arms exceed .* position_limit of joint '\w+'", str(refused.value))
+    assert "omit [stabiliser] so that the pilot proposes one" in str(refused.value)
 
 
 def test_the_largest_amplitude_keeps_every_simulated_arm_within_its_limits(known: Config) -> None:
