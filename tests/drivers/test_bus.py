@@ -36,7 +36,7 @@ def test_opened_means_ready_for_an_exchange_and_without_torque(fake_config: Make
 def test_no_reply_is_lost_whatever_the_adapters_delay_and_its_former_timer(
     fake_config: Make, fake_file: File, monkeypatch: pytest.MonkeyPatch, latency_us: int
 ) -> None:
-    monkeypatch.setattr("hil.drivers.port.adapter_latency", lambda _: 0.016)
+    monkeypatch.setattr("hil.drivers.port.port.adapter_latency", lambda _: 0.016)
     monkeypatch.setattr(Port, "lower_latency", lambda port: setattr(port, "latency", 1e-3))
     url = fake_file(("adapter_latency_us = 60.0", f"adapter_latency_us = {latency_us}"))
     with ServoBus.open(fake_config(url, interval=4e-3)) as bus:

@@ -172,8 +172,8 @@ class Line:
         self.port = open_port(os.ttyname(near), 1_000_000)
         self._ready = self.port._wait_ms  # type: ignore[attr-defined]
         self.port._wait_ms = self.wait  # type: ignore[attr-defined]
-        monkeypatch.setattr("hil.drivers.port._now", lambda: self.now)
-        monkeypatch.setattr("hil.drivers.port.select", SimpleNamespace(select=self.select))
+        monkeypatch.setattr("hil.drivers.port.descriptor_port._now", lambda: self.now)
+        monkeypatch.setattr("hil.drivers.port.descriptor_port.select", SimpleNamespace(select=self.select))
 
     def wait(self, milliseconds: int) -> object:
         """What the port's poll returns; a servo answers while the port waits."""

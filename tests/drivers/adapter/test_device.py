@@ -25,7 +25,7 @@ def device() -> Iterator[str]:
 
 
 def test_a_program_without_locks_is_kept_out(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hil.drivers.port.is_pseudo_terminal", lambda _: False)
+    monkeypatch.setattr("hil.drivers.port.opening.is_pseudo_terminal", lambda _: False)
     port = open_port(device, 1_000_000)
     answer = fcntl.ioctl(port._serial.fileno(), _TIOCGEXCL, bytes(4))
     assert struct.unpack("i", answer) == (1,), "only root may open the device now"
@@ -56,9 +56,9 @@ def test_a_program_that_has_the_device_open_is_named(tmp_path: Path) -> None:
 
 def test_a_device_that_another_program_uses_is_refused_and_closed(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr("hil.drivers.port.is_pseudo_terminal", lambda _: False)
-        patch.setattr("hil.drivers.port.keep_others_out", lambda _: None)
-        patch.setattr("hil.drivers.port.other_users", lambda _: ["screen (PID 12)"])
+        patch.setattr("hil.drivers.port.opening.is_pseudo_terminal", lambda _: False)
+        patch.setattr("hil.drivers.port.opening.keep_others_out", lambda _: None)
+        patch.setattr("hil.drivers.port.opening.other_users", lambda _: ["screen (PID 12)"])
         with pytest.raises(PortNotOpened, match=r"already open in screen \(PID 12\).*Close that program"):
             open_port(device, 1_000_000)
     open_port(device, 1_000_000).close()
@@ -91,7 +91,7 @@ def test_a_baud_rate_that_the_adapter_replaces_by_another_one_is_refused(
         actual = true_baud(descriptor)
         return actual if actual is None or actual <= 3_000_000 else 9_600
 
-    monkeypatch.setattr("hil.drivers.port.true_baud", limited)
+    monkeypatch.setattr("hil.drivers.port.opening.true_baud", limited)
     with pytest.raises(PortNotOpened, match="cannot be set to 4000000 baud: its adapter runs at 9600"):
         open_port(device, 4_000_000)
     port = open_port(device, 1_000_000)
@@ -104,7 +104,7 @@ def test_a_baud_rate_that_the_adapter_replaces_by_another_one_is_refused(
 def test_a_baud_rate_that_the_adapter_does_not_hit_exactly_will_do(
     device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hil.drivers.port.true_baud", lambda _: 1_020_000)
+    monkeypatch.setattr("hil.drivers.port.opening.true_baud", lambda _: 1_020_000)
     open_port(device, 1_000_000).close()
 
 
@@ -149,8 +149,8 @@ def test_an_adapter_that_was_reset_is_used_again_under_its_new_name(
     device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plugged: dict[str, str] = {}
-    monkeypatch.setattr("hil.drivers.port.adapter_name", lambda _: "usb-A")
-    monkeypatch.setattr("hil.drivers.port.device_of", plugged.get)
+    monkeypatch.setattr("hil.drivers.port.descriptor_port.adapter_name", lambda _: "usb-A")
+    monkeypatch.setattr("hil.drivers.port.descriptor_port.device_of", plugged.get)
     master, slave = os.openpty()
     port = open_port(os.ttyname(slave), 1_000_000)
     os.close(slave)

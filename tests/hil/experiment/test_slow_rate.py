@@ -78,7 +78,7 @@ def test_a_slow_adapter_leaves_exchanges_out_and_delays_no_sample(
     arm: Arm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = arm(*AT_20_HZ, ("adapter_latency_us = 60.0", "adapter_latency_us = 16000.0"))
-    monkeypatch.setattr("hil.drivers.port.adapter_latency", lambda _: 0.017)
+    monkeypatch.setattr("hil.drivers.port.port.adapter_latency", lambda _: 0.017)
     samples = run(config, tmp_path / "run", lambda _: None)
     assert np.abs(samples["time_before_write"] - samples["deadline"]).max() < 1e-3
     assert not samples["missing"].any()

@@ -92,7 +92,7 @@ def test_a_latency_timer_that_may_not_be_set_is_refused_with_the_command_to_type
     timer = tmp_path / "latency_timer"
     timer.write_text("16")
     monkeypatch.setattr("hil.experiment.run.latency_timer", lambda _: timer)
-    monkeypatch.setattr("hil.drivers.port.adapter_latency", lambda _: 0.016)
+    monkeypatch.setattr("hil.drivers.port.port.adapter_latency", lambda _: 0.016)
     config = arm()
     with pytest.raises(WrongSetting, match=rf"latency timer is 16 ms.*Type: echo 1 \| sudo tee {timer}"):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None)
