@@ -8,6 +8,7 @@ from hil.drivers.others.read_back import Overruled
 from hil.drivers.packet import Framer, HardwareError
 from hil.drivers.port import Port
 from hil.drivers.preparation.settings import arms_itself
+from hil.drivers.preparation.unsuitable import APPLY_HOMING, ignored_homing, unsuitable_drive_mode
 from hil.drivers.servo import NO_ERROR, Servo, describe_error
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import SETTINGS
@@ -27,9 +28,6 @@ _STATUS_BYTES = 14
 _MARGIN = 1.25
 _MOST_HEARD_BYTES = 4096
 _SLOWER_THAN_KNOWN_S = 1.5e-3
-
-TIME_BASED_PROFILE = 0x04
-"""Bit of Drive Mode that only affects motion profiles, which current and PWM mode do not use."""
 
 
 def learn_latency(servo: Servo) -> None:
@@ -113,13 +111,14 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     fault = servo.hardware_error()
     if fault != HardwareError(0):
         raise ServoFault(fault_text(joint, describe_error(fault), shuts_down=shuts_down(servo, fault)))
-    drive_mode = servo.read("Drive Mode")
-    if drive_mode & ~TIME_BASED_PROFILE:
+    if (drive_mode := unsuitable_drive_mode(servo)) is not None:
         raise WrongSetting(
             f"{joint.title}: Drive Mode is {drive_mode} but must be 0 (no reverse, no torque on by goal "
             "update). Set it with DYNAMIXEL Wizard 2.0; if it reversed the servo, determine `direction` and zero_ticks "
             "again."
         )
+    if offset := ignored_homing(servo):
+        raise WrongSetting(f"{joint.title}: Homing Offset is {offset}. {APPLY_HOMING}.")
     secondary = servo.read("Secondary(Shadow) ID")
     if secondary in others:
         raise WrongSetting(

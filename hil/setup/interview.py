@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from hil.drivers.control_table import load_control_table
 from hil.drivers.port import Port
-from hil.drivers.preparation.prepare import TIME_BASED_PROFILE
+from hil.drivers.preparation.unsuitable import APPLY_HOMING, ignored_homing, unsuitable_drive_mode
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import SERVO_MODELS, servo_model
 from hil.errors import ExperimentError
@@ -41,11 +41,13 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
     for servo in handles:
         if servo.read("Torque Enable"):
             raise ExperimentError(f"{servo.title} still has its torque on. Power-cycle it, then start again.")
-    if modes := [f"{one.title}: {mode}" for one in handles if (mode := one.read("Drive Mode")) & ~TIME_BASED_PROFILE]:
+    if modes := [f"{one.title}: {mode}" for one in handles if (mode := unsuitable_drive_mode(one)) is not None]:
         raise ExperimentError(
             f"Drive Mode must be 0, or directions and zeros measured now would be wrong later ({'; '.join(modes)}). "
             "Set it to 0 with DYNAMIXEL Wizard 2.0, then run the same command again."
         )
+    if homing := [f"{one.title}: {offset}" for one in handles if (offset := ignored_homing(one))]:
+        raise ExperimentError(f"Homing Offset is ignored now ({'; '.join(homing)}). {APPLY_HOMING}, with hil init.")
     names = [_name(number, found, ask) for number, found in enumerate(chosen)]
     stance = _stance(ask, say)
     tilt = (

@@ -14,8 +14,9 @@ from hil.drivers.control_table import model_names
 from hil.drivers.errors import BusShared, DriverError, NoReply, PortLost, PortNotOpened, WrongSetting
 from hil.drivers.joint import Joint
 from hil.drivers.packet import MAX_ID, HardwareError
-from hil.drivers.preparation.prepare import TIME_BASED_PROFILE, check_quiet, shuts_down
+from hil.drivers.preparation.prepare import check_quiet, shuts_down
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself
+from hil.drivers.preparation.unsuitable import APPLY_HOMING, ignored_homing, unsuitable_drive_mode
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
 from hil.drivers.torque.held import switched_on
@@ -288,9 +289,20 @@ def _drive_mode(config: Config, _joint_config: JointConfig, _joint: Joint, servo
         "on. Set it with DYNAMIXEL Wizard 2.0."
     )
     if drive_mode & 1:
-        how = "hil pose --guide" if config.is_chain else "hil init"
-        fix += f" Then `direction` and zero_ticks are no longer right: determine them again, with {how}."
-    return _graded(not drive_mode & ~TIME_BASED_PROFILE, "drive mode", str(drive_mode), fix)
+        fix += (
+            f" Then `direction` and zero_ticks are no longer right: determine them again, with {_finds_zeros(config)}."
+        )
+    return _graded(unsuitable_drive_mode(servo) is None, "drive mode", str(drive_mode), fix)
+
+
+def _homing(config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+    offset = ignored_homing(servo)
+    found = f"{offset} ticks, ignored in this Operating Mode" if offset else "no hidden offset"
+    return _graded(not offset, "homing offset", found, f"{APPLY_HOMING}, with {_finds_zeros(config)}.")
+
+
+def _finds_zeros(config: Config) -> str:
+    return "hil pose --guide" if config.is_chain else "hil init"
 
 
 def _secondary_id(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
@@ -423,6 +435,7 @@ _LOOKS: tuple[_Look, ...] = (
     _hardware_error,
     _torque,
     _drive_mode,
+    _homing,
     _secondary_id,
     _mode,
     _baud,

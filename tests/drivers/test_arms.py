@@ -109,6 +109,17 @@ def test_a_reversed_second_servo_is_refused_and_a_time_based_profile_is_not(open
     opened(arm(PAIR[0], PAIR[1] | {"registers": {"Drive Mode": 4}}, {}), SHOULDER, ELBOW)[0].close()
 
 
+ALONE = Joint("shoulder", 1, XM430, zero_ticks=2048), Joint("elbow", 2, XM430, zero_ticks=2048)
+
+
+def test_a_homing_offset_that_the_change_of_mode_would_apply_is_refused(opened: Open) -> None:
+    hidden = {"Homing Offset": 1025}
+    with pytest.raises(WrongSetting, match=r"'elbow' .*Homing Offset is 1025. Position Control Mode ignores"):
+        opened(arm({}, {"registers": hidden}), *ALONE)
+    for accepted in ({"Homing Offset": 1024}, hidden | {"Operating Mode": 4}):
+        opened(arm({}, {"registers": accepted}), *ALONE)[0].close()
+
+
 # Current and PWM on one arm
 
 

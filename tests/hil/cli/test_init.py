@@ -155,24 +155,38 @@ def test_a_bus_that_makes_no_arm_is_said(arm_file: ArmFile) -> None:
         port.close()
 
 
-@pytest.mark.parametrize("mode", [1, 4, 8])
-def test_a_drive_mode_that_check_refuses_is_said_before_anything_is_measured(arm_file: ArmFile, mode: int) -> None:
-    """Directions and zeros measured on a reversed servo are wrong once its Drive Mode is 0."""
+SET_TO_0 = r": {}\). Set it to 0 .* run the same command again"
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "said"),
+    [
+        ("Drive Mode", 1, SET_TO_0.format(1)),
+        ("Drive Mode", 4, ""),
+        ("Drive Mode", 8, SET_TO_0.format(8)),
+        ("Homing Offset", 1024, ""),
+        ("Homing Offset", 1025, r": 1025\). Position Control Mode ignores .* again, with hil init"),
+    ],
+)
+def test_a_setting_that_check_refuses_is_said_before_anything_is_measured(
+    arm_file: ArmFile, register: str, value: int, said: str
+) -> None:
+    """Directions and zeros measured on a reversed servo, or beside an ignored offset, are wrong later."""
     servo = "[[fake.servos]]\nid = 2\n"
-    port = open_port(port_url(str(arm_file((servo, f'{servo}registers = {{ "Drive Mode" = {mode} }}\n')))), 1_000_000)
+    changed = arm_file((servo, f'{servo}registers = {{ "{register}" = {value} }}\n'))
+    port = open_port(port_url(str(changed)), 1_000_000)
     asked: list[str] = []
 
     def ask(question: str, usual: str) -> str:
         asked.append(question.split(" ", 1)[0])
         return usual
 
-    refused = pytest.raises(ExperimentError, match=rf"ID 2.*: {mode}\). Set it to 0 .* run the same command again")
     try:
-        with nullcontext() if mode == 4 else refused:
+        with pytest.raises(ExperimentError, match=f"ID 2.*{said}") if said else nullcontext():
             interview(port, "fake://", list(scan(port, (1_000_000,))), ask, lambda _: None)
     finally:
         port.close()
-    assert mode == 4 or asked == ["IDs"]
+    assert not said or asked == ["IDs"]
 
 
 @pytest.mark.parametrize("model", SERVO_MODELS)
