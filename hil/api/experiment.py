@@ -15,7 +15,7 @@ from hil.clearance.doubts import doubts
 from hil.config.schema import Config
 from hil.drivers.errors import DriverError
 from hil.dry_run.ensemble import earlier_result
-from hil.errors import ConfigError, StopRequested
+from hil.errors import ConfigError, RunFolderError, StopRequested
 from hil.estimation.after_a_stop import after_a_failure, after_a_stop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
@@ -142,7 +142,7 @@ def _tell_doubts(config: Config, tell: OnProgress) -> None:
 
 
 def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: Path) -> list[str]:
-    if isinstance(stopped, KeyboardInterrupt | StopRequested):
+    if isinstance(stopped, KeyboardInterrupt | StopRequested | RunFolderError):
         said = after_a_stop(run, command, shown)
     else:
         failed = isinstance(stopped, DriverError) or getattr(stopped, "exit_code", 0) == 1
@@ -165,6 +165,8 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
         yield
     except BaseException as stopped:
         if not run.discard_if_unused():
+            if isinstance(stopped, RunFolderError):
+                stopped.exit_code = 1  # the disk became full, or the folder was lost: the input was right
             with suppress(Exception):  # a failing hint must not hide what stopped the arm, or its torque state
                 for line in _how_to_go_on(stopped, run, command, shown):
                     stopped.add_note(line)

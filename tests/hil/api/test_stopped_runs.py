@@ -4,6 +4,7 @@ import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from hil.api import experiment
 from hil.api.progress import OnProgress, Progress, forgiving
 from hil.drivers.errors import BusShared
-from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
+from hil.errors import Cause, ExperimentError, RunFolderError, SafetyStop, StopRequested
 from hil.estimation import after_a_stop
 from hil.estimator.errors import RecordingError
 from hil.plan.plan import IDENTIFY
@@ -120,6 +121,16 @@ def test_exit_in_a_progress_callback_is_logged_and_an_interrupt_reaches_the_main
     background = Background(ends(KeyboardInterrupt), 4)
     background.put(Progress("experiment"))
     assert background.close(5.0) == [] and interrupted.is_set()
+
+
+def test_a_disk_that_fills_up_after_the_experiment_leaves_a_command(tmp_path: Path) -> None:
+    full = RunFolderError("run/report.html cannot be written: No space left on device.")
+    run: Any = SimpleNamespace(discard_if_unused=lambda: False, result_path=tmp_path / "result.json", path=tmp_path)
+    run.result_path.touch()
+    with pytest.raises(RunFolderError) as ended, experiment._discarding(run, "identify", Path("arm.toml")):
+        raise full
+    assert ended.value.exit_code == 1
+    assert ended.value.__notes__ == ["The result is kept; the report is missing.", f"Next: hil report {tmp_path}"]
 
 
 @pytest.mark.parametrize(
