@@ -10,6 +10,9 @@ from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.fakes.plants.arm import PI
 from hil.unit_hints import in_other_units
 
+MIN_RATE = 20
+"""Lowest experiment.rate [Hz]."""
+
 DRIFT = 5.0
 """Limit on slow drift between periods, as a multiple of experiment.settle_within."""
 
@@ -17,7 +20,7 @@ DRIFT = 5.0
 class ExperimentConfig(Table):
     """`[experiment]`: the excitation and how it is streamed."""
 
-    rate: float = Field(ge=20, le=4000, description="samples per second")
+    rate: float = Field(ge=MIN_RATE, le=4000, description="samples per second")
     period: float = Field(gt=0, le=1000, description="s")
     band: Range | None = Field(
         None, description="Hz: lowest and highest frequency; the lines between are divided among the joints"

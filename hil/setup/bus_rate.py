@@ -11,6 +11,7 @@ from math import floor, isinf
 
 import numpy as np
 
+from hil.config.experiment import MIN_RATE
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
@@ -240,7 +241,7 @@ def _fix(used: ExchangeMode, modes: list[ExchangeMode], wanted: float) -> str:
         if wanted * best.slowest_s <= SHARE
         else ""
     )
-    return (
-        f"{busy}Set experiment.rate to at most {best.rate:.0f}, or raise the baud rate, or lower the latency timer "
-        "and the return delay."
-    )
+    faster = "raise the baud rate, or lower the latency timer and the return delay."
+    if best.rate < MIN_RATE:
+        return f"{busy}An experiment needs at least {MIN_RATE} Hz: {faster}"
+    return f"{busy}Set experiment.rate to at most {best.rate:.0f}, or {faster}"

@@ -52,6 +52,7 @@ def test_a_rate_that_leaves_no_time_to_read_goals_back_is_said(arm_file: ArmFile
         ([6e-3, 2e-3], 1.5e-3, ""),
         ([6e-3, 6e-3], 1.5e-3, "Half of the exchanges are fast enough, so other programs may be keeping"),
         ([6e-3, 6e-3], 6e-3, "Set experiment.rate to at most 150"),
+        ([60e-3, 60e-3], 60e-3, "An experiment needs at least 20 Hz: raise the baud rate"),
         ([2e-3], 1.5e-3, ""),
     ],
 )
