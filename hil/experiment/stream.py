@@ -324,8 +324,13 @@ class Stream:
                 against = f" Or {opposed(joint)}" if joint.seconds else ""
                 raise DidNotMove(
                     f"{joint.title} moved by only {way:.4f} rad in a whole period: it is stuck, or friction holds it."
-                    f"{against} Move it by hand with torque off; if it is free, raise experiment.peak_torque."
+                    f"{against} Move it by hand with torque off; if it is free, {self._more_torque()}."
                 )
+
+    def _more_torque(self) -> str:
+        if self._config.experiment.pilot:  # which chooses the torque
+            return "widen position_limit or raise the lower end of experiment.band, so that more torque is safe"
+        return "raise experiment.peak_torque"
 
     def _play_period(self, segment: Segment, period: int) -> None:
         """Play one period and compare each sample with that of the previous period."""

@@ -21,6 +21,9 @@ from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
 from hil.setup.session.servo_session import Say, servo_session
 
+_BAND_RAISE = 3.0
+"""Factor by which the lower end of experiment.band is raised if friction holds a joint during a full run."""
+
 
 def identify_in_steps(
     config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say, earlier: Result | None = None
@@ -48,7 +51,8 @@ def identify_in_steps(
 
 
 def _full(search: Search, config: Config, found: Amplitude) -> Played:
-    """Play the full run; repeat it with less torque if it exceeded a limit, and with other waves if it did not settle.
+    """Play the full run; repeat it with less torque if it exceeded a limit, and with other waves if it did not settle,
+    and at higher frequencies if friction held a joint.
 
     Friction may stop an arm in a different place in every period, however long it moves, so each repetition tolerates a
     larger difference. The fit does not need equal periods, and the verdict says how well they are predicted.
@@ -72,6 +76,13 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
         else:
             search.cap = _after_unsettled(search, found, played.error)
             search.config = _tolerant(search.config, options.max_settle_within)
+            if isinstance(played.error, DidNotMove) and (faster := _faster(search.config, options.max_low)) is not None:
+                low, high = faster.experiment.band or ()
+                say(
+                    "At higher frequencies more torque is safe, and friction does not hold the arm: the waves now have "
+                    f"{low:g} to {high:g} Hz."
+                )
+                search.config = faster
             config = search.held
             plan = search.waves(config)
         before, found = found.peak_torque, search.amplitude(config, 1.0, plan)
@@ -91,6 +102,22 @@ def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -
     lowered = options.torque_after_unsettled * found.peak_torque
     least = options.torque_over_friction * friction
     return np.maximum(lowered, np.minimum(found.peak_torque, least))
+
+
+def _faster(config: Config, max_low: float) -> Config | None:
+    """The configuration with a band that begins at a higher frequency, at most `max_low` times its upper end; None if
+    there is no such band.
+
+    With static friction far above that of motion, a torque that moves the joint slowly moves it too far.
+    """
+    experiment = config.experiment
+    if experiment.band is None:
+        return None
+    low, high = experiment.band
+    raised = round(min(_BAND_RAISE * low, max_low * high) * experiment.period) / experiment.period
+    if raised <= low:
+        return None
+    return config.model_copy(update={"experiment": experiment.model_copy(update={"band": [raised, high]})})
 
 
 def _tolerant(config: Config, most: float) -> Config:

@@ -228,6 +228,22 @@ def test_a_period_unlike_the_one_before_repeats_the_full_run_with_less_torque_an
     assert second[0].experiment.seed != first[0].experiment.seed
 
 
+def test_a_joint_that_friction_holds_gets_waves_of_higher_frequency(config: Config, tmp_path: Path) -> None:
+    """Fast waves need more torque for the same motion, and so exceed static friction without exceeding a limit."""
+    search = searched(config, tmp_path, Held([0.0, 0.0]))
+    found = search._with(config, search.waves(config), np.array([0.3, 0.2]))
+    zeros = np.zeros((4, 2))
+    held = Played(Step("Full run", found.peak_torque, zeros, zeros, zeros), None, "", DidNotMove("stuck"))
+    search.play = Mock(side_effect=[held, replace(held, error=None)])  # type: ignore[method-assign]
+    search.run = Mock()
+    full._full(search, config, found)
+    first, second = ((call.args[0].experiment.band, call.args[3].peak_torque) for call in search.play.call_args_list)
+    assert second[0] == [3.0 * first[0][0], first[0][1]]
+    assert (second[1] > first[1]).any()
+    highest = config.model_copy(update={"experiment": config.experiment.model_copy(update={"band": [2.0, 5.0]})})
+    assert full._faster(highest, OPTIONS.max_low) is None
+
+
 def test_torque_that_hardly_exceeds_friction_is_not_lowered_and_a_joint_that_stood_gets_more(
     config: Config, tmp_path: Path
 ) -> None:
