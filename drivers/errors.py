@@ -10,6 +10,7 @@ __all__ = [
     "PortNotOpened",
     "ServoFault",
     "ServoRefused",
+    "TorqueDoubted",
     "TorqueHeld",
     "TorqueNotOff",
     "UnknownModel",
@@ -55,7 +56,20 @@ class WrongReply(DriverError):
 
 
 class ServoRefused(DriverError):
-    """The servo understood an instruction and refused it. Example: writing an EEPROM register while torque is on."""
+    """The servo understood an instruction and refused it. Example: writing an EEPROM register while torque is on.
+
+    code: the error number in its status packet; 0 if it only holds another value than was written.
+    """
+
+    def __init__(self, message: str, code: int = 0) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class TorqueDoubted(ServoRefused):
+    """The servo reads back as without torque, but locks its EEPROM as if torque were on. Example: a register that does
+    not show what the servo does.
+    """
 
 
 class ServoFault(DriverError):

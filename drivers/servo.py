@@ -186,8 +186,9 @@ class Servo:
             self._sdk_port.patience = PATIENCE_S * self.port.growth ** (attempts - 1 - left)
             value, result, error = action()
             others.add(self._sdk.heard)
-            if result == COMM_SUCCESS and not (is_read and error & ~ALERT):
-                break  # a read that is refused is tried again: nothing depends on how often a register is read
+            refused = error & ~ALERT
+            if result == COMM_SUCCESS and not (is_read and refused) and refused != StatusError.CRC:
+                break  # refused reads and damaged requests are tried again: the servo has done nothing
             late = late or result == COMM_RX_TIMEOUT
             if left == 1 and result != COMM_RX_TIMEOUT and is_read:
                 # A busy computer delivers replies late and in pieces, which are then discarded before the last attempt.
@@ -214,9 +215,14 @@ class Servo:
                 f"its cable and supply, and look for a second servo with ID {self.id}. Replies may also have come too "
                 "late because other programs keep this computer busy; if so, close them and try again."
             )
-        refused = error & ~ALERT
+        if refused == StatusError.CRC:
+            raise ServoRefused(
+                f"{self.title} receives damaged requests ({what}): check its cable, its supply and the adapter, and "
+                "whether a second device sends at the same time.",
+                refused,
+            )
         if refused:
-            raise ServoRefused(f"{self.title} refused {what}: {describe_status_error(refused)}.")
+            raise ServoRefused(f"{self.title} refused {what}: {describe_status_error(refused)}.", refused)
         return value
 
 
@@ -232,7 +238,10 @@ def describe_error(error: HardwareError) -> str:
 
 
 def _not_held(title: str, register: str, value: int, actual: int) -> ServoRefused:
-    return ServoRefused(f"{title}: {register} was written as {value} but reads back as {actual}.")
+    return ServoRefused(
+        f"{title}: {register} was written as {value} but reads back as {actual}. Another program writes to this servo, "
+        "or the servo does not obey: end that program, or power-cycle the servo."
+    )
 
 
 def describe_status_error(code: int) -> str:

@@ -6,11 +6,12 @@ goals and gains (ROBOTIS e-Manual, Operating Mode). Goal Position is left out: a
 when torque is switched on, and an old value must never move an arm.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 
 from hil.drivers.control_table import Register
-from hil.drivers.errors import DriverError, WrongReply, WrongSetting
+from hil.drivers.errors import DriverError, ServoRefused, TorqueDoubted, WrongReply, WrongSetting
+from hil.drivers.packet import StatusError
 from hil.drivers.servo import Servo
 
 STATUS_LEVEL = "Status Return Level"
@@ -38,12 +39,13 @@ Other writable EEPROM registers are not restored:
 - Moving Threshold, External Port Mode: they affect neither the motion nor the replies that this program uses.
 """
 
-EEPROM = ("Current Limit", "Operating Mode", *PROTECTIVE)
-"""EEPROM registers to restore, in this order; Current Limit comes first because it bounds Goal Current."""
+EEPROM = ("Operating Mode", "Current Limit", *PROTECTIVE)
+"""EEPROM registers to restore, in this order: Operating Mode comes first because it resets RAM, and because a goal in
+current mode is torque.
+"""
 
 # Not in it: LED, which only shines; Torque Enable, which is cut; Goal Position (see above).
-RAM = (
-    STATUS_LEVEL,  # first, so that the other writes are confirmed
+_GAINS = (
     "Velocity I Gain",
     "Velocity P Gain",
     "Position D Gain",
@@ -51,12 +53,15 @@ RAM = (
     "Position P Gain",
     "Feedforward 2nd Gain",
     "Feedforward 1st Gain",
-    "Goal PWM",
-    "Goal Current",
-    "Goal Velocity",
     "Profile Acceleration",
     "Profile Velocity",
 )
+_GOALS = ("Goal PWM", "Goal Current", "Goal Velocity")
+
+RAM = (STATUS_LEVEL, *_GAINS, *_GOALS)
+"""Registers in RAM to restore. Status Return Level comes first, so that the other writes are confirmed; goals come
+last, when mode and limits are those that they belong to.
+"""
 
 _BOUNDS = {
     "Goal PWM": "PWM Limit",
@@ -113,19 +118,88 @@ def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
 def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, int]]:
     """Restore the registers that differ from `settings`; return their old and new values by name.
 
-    Goals are restored as far as the servo's limits allow (`attainable`). Each register is read back. Raises
-    WrongSetting if torque is on. Raises the errors of `Servo.write` only after all other registers have been tried; the
-    error then has the registers `in_doubt`, and its message names them.
+    Goals are restored as far as the servo's limits allow (`attainable`), and only if torque is still off and the mode
+    and the limits are those that the goals belong to: in current mode, the former goal of a position-controlled servo
+    is full torque. The Bus Watchdog, which may be all that stops the motor, is cleared no earlier. Each register is
+    read back.
+
+    Raises WrongSetting if torque is on, and TorqueDoubted if EEPROM is locked although torque reads back as off. Raises
+    the errors of `Servo.write` only after all other registers have been tried; the error then has the registers
+    `in_doubt`, and its message names them.
     """
-    if servo.read_despite_error("Torque Enable"):
-        raise WrongSetting(f"{servo.title}: its settings cannot be restored while its torque is on.")
-    if servo.read_despite_error("Bus Watchdog") != 0:
-        servo.write_despite_error("Bus Watchdog", 0)  # goals are read-only while it is tripped
+    _refuse_torque(servo)
     settings = attainable(servo, settings)
     written: dict[str, tuple[int, int]] = {}
     failures: dict[str, DriverError] = {}
-    for name in (*EEPROM, *RAM, "Bus Watchdog"):
-        if name not in settings or name not in servo.table:
+    _restore(servo, settings, (STATUS_LEVEL, *EEPROM), written, failures)
+    if any(isinstance(each, ServoRefused) and each.code == StatusError.ACCESS for each in failures.values()):
+        raise _doubted(servo, failures)
+    _restore(servo, settings, _GAINS, written, failures)
+    goals = (*_GOALS, "Bus Watchdog")
+    if reasons := [failures[name] for name in ("Operating Mode", "Current Limit") if name in failures]:
+        failures |= dict.fromkeys(_differing(servo, settings, goals), reasons[0])
+    else:
+        _refuse_torque(servo)
+        _clear_watchdog(servo, failures)
+        _restore(servo, settings, goals, written, failures)
+    if failures:
+        failed = next(iter(failures.values()))
+        if len(failures) < len(RAM):  # otherwise the servo is hardly there
+            failed.in_doubt = tuple(failures)
+            failed.args = (f"{failed} Only {', '.join(failures)} may differ; all other settings are as before.",)
+        raise failed
+    return written
+
+
+def _differing(servo: Servo, settings: Mapping[str, int], names: Iterable[str]) -> list[str]:
+    """Return the registers among `names` that differ from `settings` or cannot be read."""
+    differing = []
+    for name in names:
+        if name in settings and name in servo.table:
+            with suppress(DriverError):
+                if servo.read_despite_error(name) == settings[name]:
+                    continue
+            differing.append(name)
+    return differing
+
+
+def _refuse_torque(servo: Servo) -> None:
+    if servo.read_despite_error("Torque Enable"):
+        raise WrongSetting(f"{servo.title}: its settings cannot be restored while its torque is on.")
+
+
+def _doubted(servo: Servo, failures: Mapping[str, DriverError]) -> TorqueDoubted:
+    """Arm the watchdog of a servo that locks its EEPROM, so that it stops as soon as the bus is silent, unless it has
+    tripped already; return the error.
+    """
+    with suppress(DriverError):
+        if servo.read_despite_error("Bus Watchdog") != WATCHDOG_TRIPPED:
+            servo.write_despite_error("Bus Watchdog", 1)
+    return TorqueDoubted(
+        f"{servo.title}: its Torque Enable reads 0, but it refuses to change {' and '.join(failures)}, as it does only "
+        "with torque on."
+    )
+
+
+def _clear_watchdog(servo: Servo, failures: dict[str, DriverError]) -> None:
+    """Switch the Bus Watchdog off: goals are read-only while it is tripped."""
+    try:
+        if servo.read_despite_error("Bus Watchdog") != 0:
+            servo.write_despite_error("Bus Watchdog", 0)
+    except DriverError as error:
+        failures["Bus Watchdog"] = error
+
+
+def _restore(
+    servo: Servo,
+    settings: Mapping[str, int],
+    names: Iterable[str],
+    written: dict[str, tuple[int, int]],
+    failures: dict[str, DriverError],
+) -> None:
+    """Write the registers among `names` that differ; add old and new values to `written`, and errors to `failures`."""
+    for name in names:
+        if name not in settings or name not in servo.table or name in failures:
             continue
         try:
             present = servo.read_despite_error(name)
@@ -134,13 +208,6 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
                 written[name] = present, settings[name]
         except DriverError as error:
             failures[name] = error
-    if failures:
-        failed = next(iter(failures.values()))
-        if len(failures) < len(RAM):  # otherwise the servo is hardly there
-            failed.in_doubt = tuple(failures)
-            failed.args = (f"{failed} Only {', '.join(failures)} may differ; all other settings are as before.",)
-        raise failed
-    return written
 
 
 def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | None:

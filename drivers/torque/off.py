@@ -85,6 +85,11 @@ class TorqueOff:
             driven=tuple(on),
         )
 
+    def with_doubted(self, joint: Joint, why: str) -> "TorqueOff":
+        """Return the report with a joint no longer confirmed, although its servo reads back as off."""
+        confirmed = tuple(each for each in self.confirmed if each != joint)
+        return replace(self, confirmed=confirmed, unconfirmed=(*self.unconfirmed, (joint, why)))
+
     def with_later(self, joint: Joint, *, rebooted: bool | None) -> "TorqueOff":
         """Return the report with a joint now confirmed, since its servo has answered again and reads back as off.
 

@@ -123,7 +123,7 @@ class TorqueSwitch:
             if watched:
                 servo.write("Bus Watchdog", 0)
             # A change of Operating Mode leaves Goal Current at Current Limit, so it is zeroed before torque is on.
-            servo.write("Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM", 0)
+            servo.write(_goal(joint), 0)
             if watched:
                 servo.write("Bus Watchdog", ticks)
                 self._armed.add(joint)
@@ -196,8 +196,21 @@ class TorqueSwitch:
         if interrupts:
             raise interrupts[0]
 
+    def report_doubted(self, drive: Joint, why: str) -> None:
+        """Record in `torque_off_report` that a servo (a key of `drives`) does not behave as without torque."""
+        report = self.torque_off_report or TorqueOff(tuple(self._servos), ())
+        self.torque_off_report = report.with_doubted(drive, why)
+
     def report_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> None:
-        """Record in `torque_off_report` that another program keeps torque on (`TorqueOff.with_driven`)."""
+        """Record in `torque_off_report` that another program keeps torque on (`TorqueOff.with_driven`).
+
+        A servo that is still in the mode of this program gets a goal of 0, since its goal would be this program's.
+        """
+        for drive in on:
+            with suppress(DriverError):
+                servo = self._servos[drive]
+                if servo.read_despite_error("Operating Mode") == drive.mode:
+                    servo.write_despite_error(_goal(drive), 0)
         report = self.torque_off_report or TorqueOff(tuple(self._servos), ())
         self.torque_off_report = report.with_driven(on, silent)
 
@@ -229,3 +242,7 @@ class TorqueSwitch:
         with suppress(DriverError):
             cuts = not error or shuts_down(self._servos[drive], error)
         return fault_text(drive, cause, shuts_down=cuts) if alone or error else ""
+
+
+def _goal(joint: Joint) -> str:
+    return "Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM"

@@ -35,6 +35,9 @@ _GOALS_MISSED = 2
 _REMEMBERED = 256
 """Number of latest goals kept."""
 
+_LONGEST_DELAY_S = 0.1
+"""Longest delay of requests that is taken for one [s]; an older goal that a servo seems to hold is a coincidence."""
+
 _HELD_BEFORE = 4
 """If writes are lost, a servo may also hold one of the last `_HELD_BEFORE` goals sent before a status last matched."""
 
@@ -63,6 +66,7 @@ class StatusCheck:
     def __init__(self, config: Config, heard_instead: Callable[[], str] = str, *, bears_errors: bool = False) -> None:
         self._heard_instead = heard_instead
         self._bears_errors = bears_errors
+        self._interval = 1.0 / config.experiment.rate
         self._armed = round(config.safety.watchdog / WATCHDOG_UNIT)
         self._may_be_unwatched = config.safety.allow_no_watchdog
         self._half_tick = [0.5 * abs(joint.joint.drive_unit(12.0)) for joint in config.joints]
@@ -116,7 +120,8 @@ class StatusCheck:
         (tick, seen), self._ticks[joint] = self._ticks[joint], (status.tick, now)
         if watchdog := self.look_at_watchdog(status.watchdog):
             return watchdog
-        goal, clock = self._goal(joint, status, sent, now), self.look_at_clock(joint, status.tick, now)
+        clock = self.look_at_clock(joint, status.tick, now)
+        goal = self._goal(joint, status, sent, now)
         if goal and not clock and ((tick == status.tick and now - seen > _TICK_S) or self._clock[joint][3]):
             return OLD_REPLIES  # an old reply holds an old goal, which proves nothing about the goals
         return clock or goal
@@ -164,10 +169,16 @@ class StatusCheck:
             return None
         if former is not None and (late := self._late(joint, status.goal, former, self._cycles - missed_at)):
             cycles = "a cycle" if late == 1 else f"{late} cycles"
-            return Cause.STALE, (
-                f"returns stale data: it holds a goal that it seemed to have missed before, so its replies are "
-                f"{cycles} late. Check the adapter, its latency and its cable."
-            )
+            if not self._is_recent(joint, late):
+                return Cause.STALE, (
+                    f"returns stale data: it holds a goal that it seemed to have missed before, so its replies are "
+                    f"{cycles} late. Check the adapter, its latency and its cable."
+                )
+            if late * self._interval <= _LONGEST_DELAY_S:
+                return Cause.GOALS_LOST, (
+                    f"receives goals {cycles} late: by its own clock its replies are recent. A device between adapter "
+                    "and servo delays requests. Check the adapter, its latency and its cable."
+                )
         unit = self._unit[joint]
         held = f"it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent"
         if self._is_foreign[joint] or is_repeated:
@@ -177,6 +188,11 @@ class StatusCheck:
                 "corrupted on the bus (check the adapter and the cable)."
             )
         return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {self.why_lost()}"
+
+    def _is_recent(self, joint: int, late: int) -> bool:
+        """Whether the servo's clock contradicts replies that are `late` cycles old: it shows delays of several ms."""
+        readings, stale = self._clock[joint][2:]
+        return readings >= _LEARNT_READINGS and not stale and late * self._interval > 2 * _CLOCK_TOLERANCE_S
 
     def _late(self, joint: int, held: float, former: float, ago: int) -> int:
         """Return by how many cycles a servo's replies must be late, at least 0.

@@ -76,13 +76,13 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
         else:
             search.cap = _after_unsettled(search, found, played.error)
             search.config = _tolerant(search.config, options.max_settle_within)
-            if isinstance(played.error, DidNotMove) and (faster := _faster(search.config, options.max_low)) is not None:
-                low, high = faster.experiment.band or ()
+            if isinstance(played.error, DidNotMove) and (band := _faster(search.config, options.max_low)):
+                experiment = search.config.experiment.model_copy(update={"band": band})
+                search.config = search.config.model_copy(update={"experiment": experiment})
                 say(
                     "At higher frequencies more torque is safe, and friction does not hold the arm: the waves now have "
-                    f"{low:g} to {high:g} Hz."
+                    f"{band[0]:g} to {band[1]:g} Hz."
                 )
-                search.config = faster
             config = search.held
             plan = search.waves(config)
         before, found = found.peak_torque, search.amplitude(config, 1.0, plan)
@@ -104,20 +104,18 @@ def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -
     return np.maximum(lowered, np.minimum(found.peak_torque, least))
 
 
-def _faster(config: Config, max_low: float) -> Config | None:
-    """The configuration with a band that begins at a higher frequency, at most `max_low` times its upper end; None if
-    there is no such band.
+def _faster(config: Config, max_low: float) -> list[float]:
+    """The experiment's band, beginning at a higher frequency, at most `max_low` times its upper end [Hz]; [] if there
+    is no such band.
 
     With static friction far above that of motion, a torque that moves the joint slowly moves it too far.
     """
     experiment = config.experiment
     if experiment.band is None:
-        return None
+        return []
     low, high = experiment.band
     raised = round(min(_BAND_RAISE * low, max_low * high) * experiment.period) / experiment.period
-    if raised <= low:
-        return None
-    return config.model_copy(update={"experiment": experiment.model_copy(update={"band": [raised, high]})})
+    return [raised, high] if raised > low else []
 
 
 def _tolerant(config: Config, most: float) -> Config:

@@ -16,7 +16,7 @@ from pathlib import Path
 from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import BusShared, DriverError, PortLost, ServoRefused
+from hil.drivers.errors import BusShared, DriverError, PortLost, ServoRefused, TorqueDoubted
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import PROTECTIVE, read_settings
 from hil.drivers.servo_model import Mode
@@ -160,6 +160,9 @@ class ServoSession:
         ]:
             self._say(f"What another program had changed has been restored ({'; '.join(told)}).")
         saved.forget(joint for joint in saved.kept if joint not in failed)
+        for joint, error in failed.items():
+            if isinstance(error, TorqueDoubted):
+                self.bus.report_doubted(joint, str(error))
         return [*self._switched_on_by_another(), *left]
 
     def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
@@ -249,15 +252,30 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             raise
         finally:
             _outermost.reset(token)
-            before = bus.torque_off_report
-            with signals_held_back():
-                left = session.end()
+            _end(session, stopped)
+
+
+def _end(session: ServoSession, stopped: BaseException | None) -> None:
+    """Restore the settings, and tell with the exception that ends the session what could not be restored.
+
+    A signal that arrives meanwhile ends the session instead of `stopped`, with the same notes.
+    """
+    bus, before = session.bus, session.bus.torque_off_report
+    left: list[str] = []
+    try:
+        with signals_held_back():
+            left = session.end()
             if bus.port.strangers and not isinstance(stopped, BusShared):
                 left.append(
                     "Another program sent packets on this bus while the servos were being set up or restored. End it "
                     "before the next start: it may move the arm."
                 )
-            end_with(bus, stopped, left, before)
+    except BaseException as signalled:
+        for line in getattr(stopped, "__notes__", []):
+            signalled.add_note(line)
+        end_with(bus, signalled, left, before)
+        raise
+    end_with(bus, stopped, left, before)
 
 
 def has_moved() -> bool:

@@ -431,10 +431,11 @@ def test_where_one_register_cannot_be_restored_the_message_names_it_and_no_other
             raise ServoRefused("It refuses to set its Operating Mode.")
         write(servo, name, value)
 
-    said = r"Some settings of joint 'elbow' \(ID 2.*\) may not have been restored\. .*Only Operating Mode may differ"
+    said = r"Some settings of joint 'elbow' \(ID 2.*\) may not have been restored\. .*Only Operating Mode, Goal Current"
     with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
         monkeypatch.setattr(Servo, "write_despite_error", refused)
-    assert [each.split(" of ")[0] for each in bench.changed()] == ["Operating Mode"]
+    # The goal that the servo had in position mode would be full torque in current mode.
+    assert [each.split(" of ")[0] for each in bench.changed()] == ["Operating Mode", "Goal Current"]
 
 
 def test_two_servos_of_different_models_that_swapped_their_ids_are_named() -> None:
