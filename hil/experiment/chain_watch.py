@@ -2,7 +2,8 @@
 
 Prior knowledge is the ensemble's mean and inflated covariance. While the arm is in its rest pose, something may support
 it, so no joint is judged. A joint that stands still at its rest angle may be lying against an end stop, so it is
-judged only by torques towards the side on which it has been. A joint that has not left its rest angle yet may be lying
+judged only by torques towards the side on which it has been; so is a joint that has just come back to that angle, since
+it may have hit the stop. A joint that has not left its rest angle yet may be lying
 against a stop on the side to which gravity pulls it: it is judged only while its torque acts towards that side.
 """
 
@@ -36,6 +37,8 @@ friction of up to twice the mean from raising an alarm.
 """
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
+_IMPACT_S = 0.1
+"""How long a joint that has come back to its rest angle may bounce off a stop [s]."""
 WINDOW_S = 0.3
 """Time span [s] of the torque range that a message about a stationary joint states."""
 
@@ -75,6 +78,8 @@ class ChainWatch:
         self._commanded: deque[tuple[State, Array]] = deque(maxlen=math.ceil(WINDOW_S / interval))
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
+        self._velocity, self._came_at = np.zeros(n), np.full(n, -np.inf)
+        """Latest velocities [rad/s], and when each joint last moved towards a stop near its rest angle [s]."""
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
@@ -112,10 +117,12 @@ class ChainWatch:
 
         is_away: whether each joint is away from its rest angle. torque: commanded (joints,) [N m].
         """
-        is_home = ~is_away & (np.abs(velocity) <= _STILL_RAD_S)
         may_lie = ~self._was_below & ~self._was_above & (torque * self._falls_to <= self._friction)
-        towards = self._was_below * 1.0 - self._was_above * 1.0
-        return np.asarray(is_home * np.where(may_lie, self._falls_to, towards))
+        towards = np.where(may_lie, self._falls_to, self._was_below * 1.0 - self._was_above * 1.0)
+        self._came_at = np.where(~is_away & (self._velocity * towards > _STILL_RAD_S), self._seen_at, self._came_at)
+        is_home = ~is_away & ((np.abs(velocity) <= _STILL_RAD_S) | (self._seen_at - self._came_at <= _IMPACT_S))
+        self._velocity = velocity
+        return np.asarray(is_home * towards)
 
     def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]

@@ -22,11 +22,20 @@ def config() -> Config:
     return load_config(CONFIGS / "leg.toml")
 
 
-def look(config: Config, watch: ChainWatch, position: tuple[float, ...], goal: tuple[float, ...], number: int) -> None:
+def look(
+    config: Config,
+    watch: ChainWatch,
+    position: tuple[float, ...],
+    goal: tuple[float, ...],
+    number: int,
+    knee: float = 0.0,
+) -> None:
+    """One sample. knee: velocity of the knee; the other joints stand still."""
     at = number / config.experiment.rate
     n = len(position)
+    velocity = (*(0.0,) * (n - 1), knee)
     state: Any = SimpleNamespace(
-        missing=(False,) * n, goal_current=goal, position=position, velocity=(0.0,) * n, time_before_write=at
+        missing=(False,) * n, goal_current=goal, position=position, velocity=velocity, time_before_write=at
     )
     watch.look(state)
 
@@ -46,6 +55,20 @@ def stands(config: Config, knee: float, current: float, *, was_away: bool = True
 def test_a_joint_on_the_stop_on_which_it_rests_is_not_blocked(config: Config) -> None:
     """The others are still on their way home."""
     stands(config, 0.02, -0.9)
+
+
+@pytest.mark.parametrize("at", [0.02, 0.2])
+def test_a_joint_that_comes_back_fast_may_bounce_off_that_stop(config: Config, at: float) -> None:
+    """On the way back from a path at 50 Hz, an arm of another hand hit its stop at 0.8 rad/s and was stopped for it."""
+    watch, supports = ChainWatch(config, [1.0, 1.0, 1.0]), []
+    watch._observer = cast("Any", SimpleNamespace(observe=lambda *given: supports.append(given[-1]) or -1))
+    rest = np.array(config.arm.rest_pose)
+    look(config, watch, (rest[0] + 0.3, rest[1], rest[2] + 0.5), (0.0, 0.0, 0.0), -100, -0.8)
+    for number in range(round(0.3 * config.experiment.rate)):
+        velocity = -0.8 if number == 0 else 0.1
+        look(config, watch, (rest[0] + 0.3, rest[1], rest[2] + at), (0.0, 0.0, 0.0), number, velocity)
+    blocked = [support is not None and support[2] == -1.0 for support in supports]
+    assert blocked[2] == (at < 0.1) and not blocked[-1]
 
 
 def test_but_it_is_if_a_torque_away_from_that_stop_does_not_move_it(config: Config) -> None:
