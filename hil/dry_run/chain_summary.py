@@ -71,10 +71,14 @@ def unsafe(config: Config, foreseen: ChainPrediction) -> str:
         return f"too little clearance, {foreseen}"
     if (peaks.shares[:, :GUARDED] >= 1.0).any() or peaks.stop_chance > config.safety.limit_chance:
         row, joint = nearest_limit(peaks)
-        return (
-            f"joint {config.joints[joint].name!r} reaches {QUANTITIES[row]} "
-            f"{peaks.quantile[row, joint]:.3g} (limit {peaks.limits[row, joint]:.3g}) in 1 of 100 arms"
-        )
+        limit, reached = float(peaks.limits[row, joint]), float(peaks.quantile[row, joint])
+        if peaks.is_beyond(row, joint, reached):
+            how_often = "in 1 of 100 arms"
+        else:
+            reached = float(peaks.reached_with(config.safety.limit_chance)[row, joint])
+            how_often = f"more often than safety.limit_chance allows ({100 * config.safety.limit_chance:g} %)"
+        name = config.joints[joint].name
+        return f"joint {name!r} reaches {QUANTITIES[row]} {reached:.3g} (limit {limit:.3g}) {how_often}"
     return ""
 
 
@@ -181,4 +185,4 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         lines.append(
             f"hil identify bases its decision on fewer arms. With all {run.arms}, the experiment is not safe: {doubt}."
         )
-    return [*lines, f"NOT SAFE: {why}." if why else "SAFE. Not tested on hardware."]
+    return [*lines, f"NOT SAFE: {why.rstrip('.')}." if why else "SAFE. Not tested on hardware."]

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from math import erfc, sqrt
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,9 +72,24 @@ class Prediction:
         All bounds are the same number of standard deviations above their medians, so that they change smoothly with the
         amplitude.
         """
-        shares = self.share_at(self._simultaneous())
-        toward = self.limits - self.origin
-        return np.asarray(self.origin + shares * toward)
+        return self._value_at(self._simultaneous())
+
+    def reached_with(self, chance: float) -> Array:
+        """Peaks (quantities, joints) that are exceeded with a total probability of `chance`, or the worst arm's if they
+        are farther from rest.
+        """
+        foreseen = self._value_at(NormalDist().inv_cdf(1.0 - chance / (2 * GUARDED)))
+        worst = np.take_along_axis(self.values, self.shares.argmax(axis=0)[None], axis=0)[0]
+        is_farther = np.abs(worst - self.origin) > np.abs(foreseen - self.origin)
+        return np.where(is_farther, worst, foreseen)
+
+    def is_beyond(self, quantity: int, joint: int, value: float) -> bool:
+        """Whether a peak exceeds its limit."""
+        limit, origin = self.limits[quantity, joint], self.origin[quantity, joint]
+        return bool((value - limit) * (limit - origin) >= 0.0)
+
+    def _value_at(self, deviations: float) -> Array:
+        return np.asarray(self.origin + self.share_at(deviations) * (self.limits - self.origin))
 
     @property
     def stop_chance(self) -> float:

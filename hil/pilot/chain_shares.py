@@ -163,8 +163,8 @@ class SafeShares:
                 continue
             if replace(self, given=faster, paths=paths)._largest(faster, shares)[0] is not None:
                 return (
-                    f" A safe motion exists at experiment.rate = {rate:g}. At {experiment.rate:g} Hz, delay makes a "
-                    "stiff stabiliser oscillate, and a softer one is too weak for these arms."
+                    f" Simulated at experiment.rate = {rate:g}, a motion is safe. At {experiment.rate:g} Hz, delay "
+                    "makes a stiff stabiliser oscillate, and a softer one is too weak for these arms."
                 )
         return ""
 
@@ -304,6 +304,8 @@ def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
     row, at = nearest_limit(peaks)
     joint, limit, rate = config.joints[at], float(peaks.limits[row, at]), config.experiment.rate
     typical, reached = float(peaks.median[row, at]), float(peaks.quantile[row, at])
+    if not peaks.is_beyond(row, at, reached):
+        reached = float(peaks.reached_with(config.safety.limit_chance)[row, at])
     share = (limit - typical) / (reached - typical) if reached != typical else 0.0
     has_room = LEAST_SPREAD_SHARE < share < 1.0
     helps = []

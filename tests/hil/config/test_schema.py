@@ -46,6 +46,7 @@ def test_every_ready_file_is_right(path: Path) -> None:
         ("rate = 400.0 ", "rrate = 400.0 ", r"experiment\.rrate is not a known key; did you mean rate\?"),
         ("seed = 1", "colour = 1", r"experiment\.colour is not a known key; allowed: rate, period"),
         ("[experiment]", "[experimentt]", r"experimentt is not a known key; did you mean experiment\?"),
+        ('model = "XM430-W350"', 'model = "XC430-W240"', r"joints\[1\]\.model = 'XC430-W240': must be one of 'XM430-W"),
         ('model = "XM430-W350"', 'model = "XM430-W351"', r"joints\[1\]\.model = 'XM430-W351': did you mean XM430-W350"),
         ('model = "XM430-W350"', 'model = "a motor"', r"joints\[1\]\.model = 'a motor': must be one of"),
         ("id = 2", "id = 1", r"two joints have the same id 1"),

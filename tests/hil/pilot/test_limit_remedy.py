@@ -1,5 +1,8 @@
 """What a refusal of a spatial arm's motion says to change, and by how much."""
 
+import re
+from statistics import NormalDist
+
 import numpy as np
 import pytest
 
@@ -34,6 +37,17 @@ def test_a_joint_that_sags_beyond_its_range_needs_a_wider_one_or_better_known_ma
     assert f"rest_pose {0.48 * high:.2f} rad farther from that end" in said
     assert said.endswith("([arm.prior] spread = 0.15 instead of 0.3)")
     assert "current_limit" not in said and "Hz" not in said
+
+
+def test_a_limit_that_only_rare_arms_exceed_is_widened_too() -> None:
+    """99 of 100 arms stay within it, but more arms exceed it than limit_chance allows."""
+    arms = peaks("highest position", 2, 0.8, 0.8)
+    row, high = QUANTITIES.index("highest position"), LEG.joints[2].position_limit[1]
+    arms.values[:, row, 2] = high * np.array([NormalDist(0.76, 0.09).inv_cdf((arm + 0.5) / 100) for arm in range(100)])
+    arms.shares[:, row, 2] = arms.values[:, row, 2] / high
+    assert arms.quantile[row, 2] < high and arms.stop_chance > LEG.safety.limit_chance
+    (wanted,) = re.findall(r"upper end at ([\d.]+) rad", limit_remedy(LEG, arms, STIFF))
+    assert high < float(wanted) < 1.2 * high
 
 
 def test_masses_do_not_help_where_a_typical_arm_exceeds_the_limit_nor_torque_that_is_not_used() -> None:
