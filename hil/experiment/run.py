@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from math import floor
 from pathlib import Path
 
 import numpy as np
@@ -336,8 +337,8 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if wire > 1 / rate:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms of wire time alone at "
-            f"{bus.port.baud} baud, which allows {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud rate "
-            "with `hil setup`."
+            f"{bus.port.baud} baud, which allows at most {floor(1 / wire)} Hz. Lower the rate (`hil check` measures "
+            "what is possible), or raise the baud rate with `hil setup`."
         )
     slowest = bus.port.latency + wire
     if slowest <= 1 / rate:
@@ -346,12 +347,12 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if file is not None and read_latency_ms(file) > WANTED_MS:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which allows "
-            f"at most {1 / slowest:.0f} Hz. You do not have permission to change it. Type: {command_to_set(file)}"
+            f"at most {floor(1 / slowest)} Hz. You do not have permission to change it. Type: {command_to_set(file)}"
         )
     if bus.port.latency_measured:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: even the fastest of many replies arrives {bus.port.latency * 1e3:.0f} ms "
-            f"later than its transmission time explains. This latency allows at most {1 / slowest:.0f} Hz. If other "
+            f"later than its transmission time explains. This latency allows at most {floor(1 / slowest)} Hz. If other "
             "programs keep this computer busy, close them and start again. Otherwise the adapter is slow: lower the "
             "rate, or use a wired adapter with a short latency, such as a U2D2."
         )

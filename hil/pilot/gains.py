@@ -8,6 +8,7 @@ At a low sample rate, the delay of such a spring would drive the joint (`hil.pla
 stronger and the spring softer, as far as rate and gravity allow.
 """
 
+from math import ceil
 from typing import NoReturn
 
 import numpy as np
@@ -105,7 +106,7 @@ def _refuse_rate(config: Config, index: int, away: Array, rate: float) -> NoRetu
         f"{config.path}: experiment.rate = {config.experiment.rate:g} is too low to hold joint "
         f"{config.joints[index].name!r}: in some of the possible arms, gravity drives it away from its rest pose with "
         f"{away[index]:.2g} N m/rad, and a spring that outweighs this would make the joint oscillate, because it acts "
-        f"{1e3 * DELAY_SAMPLES / config.experiment.rate:.0f} ms late. Set experiment.rate to at least {rate:.0f}."
+        f"{1e3 * DELAY_SAMPLES / config.experiment.rate:.0f} ms late. Set experiment.rate to at least {ceil(rate)}."
     )
 
 

@@ -64,10 +64,15 @@ class ExchangeMode:
         """Sustainable exchanges per second [Hz]."""
         return SHARE / self.usual_s
 
+    @property
+    def whole_rate(self) -> int:
+        """`rate` in whole Hz, rounded down, so that it is accepted."""
+        return floor(self.rate + 1e-6)
+
     def __str__(self) -> str:
         lost = f", {self.lost} of {CYCLES} replies lost" if self.lost else ""
         times = f"{self.median_s * 1e3:.2f} ms, 90 % within {self.usual_s * 1e3:.2f} ms"
-        return f"{times}, longest {self.longest_s * 1e3:.2f} ms: {self.rate:.0f} Hz{lost}"
+        return f"{times}, longest {self.longest_s * 1e3:.2f} ms: {self.whole_rate} Hz{lost}"
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,7 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
         bus.port.clock.wait_until(bus.port.clock.now() + AGAIN_AFTER_S)
         modes = [_faster(*pair) for pair in zip(modes, measure_modes(bus), strict=True)]
     used = _configured(bus, modes)
-    found, fix = f"{used.rate:.0f} Hz possible with {used.name}", _fix(used, modes, wanted)
+    found, fix = f"{used.whole_rate} Hz possible with {used.name}", _fix(used, modes, wanted)
     return RateReport(tuple(modes), found, fix, "" if fix else _delayed(used, wanted))
 
 
@@ -244,4 +249,4 @@ def _fix(used: ExchangeMode, modes: list[ExchangeMode], wanted: float) -> str:
     faster = "raise the baud rate, or lower the latency timer and the return delay."
     if best.rate < MIN_RATE:
         return f"{busy}An experiment needs at least {MIN_RATE} Hz: {faster}"
-    return f"{busy}Set experiment.rate to at most {best.rate:.0f}, or {faster}"
+    return f"{busy}Set experiment.rate to at most {best.whole_rate}, or {faster}"

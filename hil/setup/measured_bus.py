@@ -28,7 +28,7 @@ def measured_bus(arm: ArmAnswers, path: Path) -> tuple[MeasuredBus | None, str]:
     # Servos without Fast Sync Read are read without it anyway, so the file need not disable it.
     fast = mode.fast or not any(each.fast for each in modes)
     found = MeasuredBus(float(rate), mode.rate, mode.one_write, fast)
-    said = f"This bus can sustain {mode.rate:.0f} Hz with {mode.name}; rate = {rate:g} is set in the file."
+    said = f"This bus can sustain {mode.whole_rate} Hz with {mode.name}; rate = {rate:g} is set in the file."
     if mode.lost:
         said += (
             f" But {mode.lost} of {CYCLES} replies were lost: check cables, supply and termination, and whether other "
