@@ -60,9 +60,7 @@ def run_jobs(
 
     try:
         flight = _Flight(client, function, iter(items))
-        futures: Any = as_completed(  # type: ignore[no-untyped-call]
-            flight.start(flight.room), loop=client.loop, with_results=True, raise_errors=False
-        )
+        futures: Any = as_completed(flight.start(flight.room), loop=client.loop, with_results=True, raise_errors=False)
         for batch in futures.batches():
             futures.update(flight.start(len(batch) + max(0, flight.room)))
             for future, result in batch:
@@ -113,7 +111,8 @@ class _Flight(Generic[Item, Result]):
         self._submitted += len(tasks)
         self._tasks.update(zip(keys, tasks, strict=True))
         items = [[item for _, item in jobs] for jobs in tasks]
-        return self._client.map(_call, [self._function] * len(tasks), items, key=keys, pure=False)
+        futures: list[Any] = self._client.map(_call, [self._function] * len(tasks), items, key=keys, pure=False)
+        return futures
 
     def end(self, key: str, result: Any, *, lost: bool) -> tuple[list[Any], list[Ended[Item, Result]]]:
         """Futures of jobs to be repeated, and the jobs that have ended."""
