@@ -328,6 +328,8 @@ class Stream:
                 )
 
     def _more_torque(self) -> str:
+        if self._config.is_chain:
+            return "raise experiment.rate, at which a stiffer stabiliser moves it, or widen position_limit"
         if self._config.experiment.pilot:  # which chooses the torque
             return "widen position_limit or raise the lower end of experiment.band, so that more torque is safe"
         return "raise experiment.peak_torque"

@@ -287,6 +287,21 @@ def test_a_joint_that_hardly_moves_in_a_period_is_stuck(make: Make, steps: float
             settle(stream, [0.01], moved, since)
 
 
+@pytest.mark.parametrize(
+    ("kind", "advice"),
+    [
+        ("torque", "raise experiment.peak_torque"),
+        ("pilot", "experiment.band, so that"),
+        ("chain", "raise experiment.rate"),
+    ],
+)
+def test_what_moves_a_stuck_joint_is_something_that_the_configuration_takes(make: Make, kind: str, advice: str) -> None:
+    stream, bus, _ = make()
+    stream._config = SimpleNamespace(is_chain=kind == "chain", experiment=SimpleNamespace(pilot=kind != "torque"))
+    with pytest.raises(DidNotMove, match=f"if it is free, .*{advice}"):
+        stream._check_motion([0.0] * len(bus.joints))
+
+
 class Brakes:
     """In place of the brake: a current for as many exchanges as wanted."""
 
