@@ -8,7 +8,7 @@ from hil.drivers.packet import HEADER, MAX_LENGTH, NO_ID, Framer, Instruction, c
 from hil.drivers.port import Port
 
 PATIENCE_S = 0.018
-"""How long set-up work's first attempts wait for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
+"""How long set-up work initially waits for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
 
 _SHORTEST = 11
 """Number of bytes of a status packet without data."""
@@ -27,7 +27,7 @@ class SdkPort:
     def __init__(self, port: Port) -> None:
         self._port = port
         self.patience = PATIENCE_S
-        """How long to wait for a reply beyond its wire time [s]."""
+        """How long to wait beyond wire time [s]."""
         self._deadline = 0.0
         self._sent = b""
         """The last bytes written, kept as long as their echo may still arrive."""

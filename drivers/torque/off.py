@@ -40,7 +40,7 @@ _REPEATS, _REPEAT_S = 2, 0.001
 """Number of further torque-off packets and the time between them [s]: a packet that collides with a reply is lost."""
 
 _READINGS = 3
-"""Maximum number of attempts to obtain readings of Torque Enable that agree."""
+"""Maximum number of attempts to read Torque Enable twice alike."""
 
 
 @dataclass(frozen=True)

@@ -204,7 +204,7 @@ class TorqueSwitch:
     def report_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> None:
         """Record in `torque_off_report` that another program keeps torque on (`TorqueOff.with_driven`).
 
-        A servo still in this program's mode gets a goal of 0; otherwise, it would follow this program's last goal.
+        A servo still in this program's mode gets a goal of 0, or it would follow this program's last goal.
         """
         for drive in on:
             with suppress(DriverError):

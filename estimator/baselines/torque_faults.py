@@ -51,8 +51,8 @@ class Clipped:
 class Stop:
     """A yielding stop or object that a joint seems to press against beyond the angle `at` [rad].
 
-    side: 1 if the joint touches it at larger angles than `at`, -1 at smaller ones. stiffness: N m/rad. residual,
-    residual_given: relative RMS of the joint's torque residual, with the stop and without it.
+    side: 1 if it is touched at larger angles, -1 at smaller ones. stiffness: N m/rad. residual, residual_given:
+    relative RMS of the joint's torque residual, with the stop and without it.
     """
 
     joint: int
@@ -153,7 +153,7 @@ def suspect_stop(recordings: Sequence[Recording]) -> Stop | None:
 
 
 def _pressing(joint: int, at: float, side: int, positions: Array) -> Array:
-    """Return the regressor's column for a stop's stiffness (joints, samples, 1)."""
+    """Return the regressor's column for a stop (joints, samples, 1)."""
     column = np.zeros((*positions.shape, 1))
     column[joint, :, 0] = side * np.maximum(side * (positions[joint] - at), 0.0)
     return column

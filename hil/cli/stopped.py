@@ -67,9 +67,9 @@ def _catch() -> dict[signal.Signals, Any]:
 
 
 def _raise(number: int, frame: FrameType | None) -> None:
-    """Raise Terminated, but only after modules that are being loaded.
+    """Raise Terminated, but not while modules are being loaded.
 
-    Python ignores exceptions in callbacks of compiled modules while they are loaded, so the stop would be lost.
+    Python ignores exceptions in callbacks of compiled modules that are being loaded: the stop would be lost.
     """
     inner = frame
     while inner is not None:

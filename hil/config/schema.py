@@ -442,7 +442,7 @@ def _is_only_fake(path: Path) -> bool:
 
 
 def config_of(port: str) -> Path | None:
-    """The configuration to which `port`, as given to `port_url`, refers; None for a URL, a device or a fake arm."""
+    """The configuration that `port` (see `port_url`) refers to; None for a URL, a device or a fake arm."""
     if "://" in port or find_arm(port).parent == ARMS:
         return None
     config = find_config(Path(port))

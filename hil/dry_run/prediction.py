@@ -76,7 +76,7 @@ class Prediction:
 
     def reached_with(self, chance: float) -> Array:
         """Peaks (quantities, joints) that are exceeded with a total probability of `chance`, or the worst arm's if
-        those are farther from rest.
+        they are farther from rest.
         """
         foreseen = self._value_at(NormalDist().inv_cdf(1.0 - chance / (2 * GUARDED)))
         worst = np.take_along_axis(self.values, self.shares.argmax(axis=0)[None], axis=0)[0]

@@ -163,8 +163,8 @@ class SafeShares:
                 continue
             if replace(self, given=faster, paths=paths)._largest(faster, shares)[0] is not None:
                 return (
-                    f" In a simulation at experiment.rate = {rate:g}, a motion is safe. At {experiment.rate:g} Hz, "
-                    "delay makes a stiff stabiliser oscillate, and a softer one is too weak for these arms."
+                    f" Simulated at experiment.rate = {rate:g}, a motion is safe. At {experiment.rate:g} Hz, delay "
+                    "makes a stiff stabiliser oscillate, and a softer one is too weak for these arms."
                 )
         return ""
 

@@ -283,7 +283,7 @@ def _looks_long(memory: Any, velocity: float) -> bool:
     moved, difference, unknown = memory.moved, memory.difference, memory.unknown
     _add(long, LONG_S, moved, difference, velocity, seconds, memory.most_curved, unknown)
     _add(slow, SLOW_S, moved, memory.seen, velocity, seconds, memory.most_curved, 0.0)
-    slow.unknown = long.unknown  # as above: the next interval cancels a late measurement's error
+    slow.unknown = long.unknown  # as above: the next interval cancels the error
     fades = min(seconds / SLOW_S, 1.0)
     memory.heading += memory.headed - fades * memory.heading
     memory.moving -= fades * memory.moving

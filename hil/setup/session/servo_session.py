@@ -168,7 +168,7 @@ class ServoSession:
     def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
         """Cut torque where it is on and restore these servos' settings; return whether there was anything to do.
 
-        If torque has been switched on again before, it is watched for WATCH_S: one reading may fall in between.
+        If torque has been switched on again before, it is watched for WATCH_S: a single reading may come too early.
 
         failed: receives the errors of the servos whose settings could not be restored.
         """
