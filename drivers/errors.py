@@ -58,7 +58,7 @@ class WrongReply(DriverError):
 class ServoRefused(DriverError):
     """The servo understood an instruction and refused it. Example: writing an EEPROM register while torque is on.
 
-    code: the error number in its status packet; 0 if it only holds another value than was written.
+    code: the error number in its status packet; 0 if it merely holds another value than the one written.
     """
 
     def __init__(self, message: str, code: int = 0) -> None:
@@ -67,8 +67,8 @@ class ServoRefused(DriverError):
 
 
 class TorqueDoubted(ServoRefused):
-    """The servo reads back as without torque, but locks its EEPROM as if torque were on. Example: a register that does
-    not show what the servo does.
+    """Torque Enable reads as off, but the EEPROM is locked as if torque were on. Example: the register does not show
+    what the servo does.
     """
 
 

@@ -1,8 +1,8 @@
 """The control cycle on the wire: goals out and states in, with one write and one bounded read.
 
-Goals in current mode and in PWM mode have registers, and so Sync Writes, of their own. A Sync Write has no reply, so
-all packets of a cycle can be sent in one write, which takes one adapter transaction instead of two. They are prepared
-in advance; a cycle only packs the goals and computes one CRC per register.
+Current mode and PWM mode have separate goal registers and therefore separate Sync Writes. A Sync Write has no reply, so
+all packets of a cycle can be sent in one write, which takes one adapter transaction instead of two. Packets are
+prepared in advance; a cycle only packs the goals and computes one CRC per goal register.
 
 The registers that are read vary from cycle to cycle. Most cycles read `spans[0]`. Every `slow_every`-th cycle reads one
 of the other spans, in turn; every `status_every`-th cycle reads `status`, the registers that show whether torque is

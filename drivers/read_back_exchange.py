@@ -115,7 +115,7 @@ class ReadBackExchange(Exchange):
 
         Missing replies are ignored here; the next cycle detects them.
 
-        Returns what only another master can have written, or None. Raises PortLost.
+        Returns a value that only another master can have written, or None. Raises PortLost.
         """
         back = self._read_back
         if back is None or not self._sent:

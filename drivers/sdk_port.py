@@ -8,7 +8,7 @@ from hil.drivers.packet import HEADER, MAX_LENGTH, NO_ID, Framer, Instruction, c
 from hil.drivers.port import Port
 
 PATIENCE_S = 0.018
-"""How long set-up work first waits for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
+"""How long set-up work initially waits for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
 
 _SHORTEST = 11
 """Number of bytes of a status packet without data."""
@@ -53,7 +53,7 @@ class SdkPort:
             port.overheard = b""
 
     def hear(self, received: bytes) -> None:
-        """Count late replies and another master's instructions among bytes that belong to no reply."""
+        """Count late replies and another master's instructions among bytes outside the expected reply."""
         if received and not self._port.echoes:
             for packet in Framer().feed(received):
                 self._port.late_replies += packet.is_status

@@ -203,7 +203,7 @@ class Servo:
                 "are mixed up. Check that every servo has its own ID, and whether a device on the bus changes replies."
             )
         if result == COMM_RX_TIMEOUT:
-            check = f"{LATE} Otherwise, check" if self.port.late_replies else "Check"
+            check = f"{LATE} If that does not help, check" if self.port.late_replies else "Check"
             raise NoReply(
                 f"{self.title} does not answer at {self.port.baud} baud on {self.port.url} ({what}). {check} its "
                 "supply and its cable; `hil scan` shows whether it has another ID or baud rate."
@@ -239,8 +239,8 @@ def describe_error(error: HardwareError) -> str:
 
 def _not_held(title: str, register: str, value: int, actual: int) -> ServoRefused:
     return ServoRefused(
-        f"{title}: {register} was written as {value} but reads back as {actual}. Another program writes to this servo, "
-        "or the servo does not obey: end that program, or power-cycle the servo."
+        f"{title}: {register} was written as {value} but reads back as {actual}. Another program is writing to this "
+        "servo, or the servo does not obey: end that program, or power-cycle the servo."
     )
 
 

@@ -33,7 +33,7 @@ def inner(function: Any, **options: Any) -> Any:
 
 
 def embedded(function: Any, **options: Any) -> Any:
-    """Compile a function like `inner`, but without the wrapper for Python, an eighth of the time that compiling takes.
+    """Compile as `inner` does, but without the wrapper for Python, which takes an eighth of the compilation time.
 
     Only compiled code may call it: a call from Python ends the process.
     """

@@ -79,7 +79,7 @@ class PtyServer:
     """Serves one fake arm on a pseudo-terminal; `serve` runs until `stop` is called from a thread or signal handler.
 
     link: symbolic link to create for the terminal. A link that a killed server left is replaced; LinkError is raised if
-    anything else has that path, or a running server that link.
+    anything else is at that path, or if a running server uses the link.
     `bus` may be inspected, and its hand moved, from another thread that holds `lock`; from another process, `hil
     hand` moves it.
     """
@@ -236,9 +236,9 @@ class PtyServer:
 
 
 def _claim(link: Path) -> socket.socket:
-    """Claim a link until the socket is closed or the process dies, and remove it if a server that was killed left it.
+    """Claim a link until the socket is closed or the process dies, and remove the link if a killed server left it.
 
-    The claim is an abstract Unix socket, which the system frees. Raises LinkError if the link cannot be used.
+    The claim is an abstract Unix socket, which the system then frees. Raises LinkError if the link cannot be used.
     """
     path = os.fsencode(link.parent.resolve() / link.name)
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

@@ -29,8 +29,8 @@ class JointFacts:
     mode: "current" (goals in A) or "pwm" (goals in V). torque_per_goal: N m/A or N m/V at the output shaft. goal_limit:
     A or V. position_limit: rad. velocity_limit: rad/s. servos: number of servos that drive the joint together.
 
-    Of an arm that is only known from a recording, the servo is `UNKNOWN_SERVO`, the limits are the recorded extremes,
-    and the torque per goal is 1 if torques were recorded.
+    For an arm known only from a recording, the servo is `UNKNOWN_SERVO`, the limits are the recorded extremes, and the
+    torque per goal is 1 if torques were recorded.
     """
 
     name: str
@@ -45,7 +45,7 @@ class JointFacts:
 
     @property
     def has_limits(self) -> bool:
-        """Whether the limits are the joint's, not just the extremes of a recording."""
+        """Whether the limits are the joint's own, not just the extremes of a recording."""
         return self.servo != UNKNOWN_SERVO
 
     @property

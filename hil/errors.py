@@ -4,7 +4,7 @@ HilError                    exit code
 ├── ConfigError             2
 ├── CsvError                2
 ├── MissingExtra            2
-├── RunFolderError          2   1 if the folder was lost during the run
+├── RunFolderError          2   1 once samples exist
 ├── ResultError             2
 ├── ExportError             2
 ├── SchedulerLost           1

@@ -213,7 +213,7 @@ def meant_name(given: str, names: Sequence[str]) -> str:
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
     bare = re.sub(r"[^a-z0-9]", "", given.lower())
     long = [name for name in plain if len(name) > 4]
-    # Two wrong characters in a servo's name are another servo: XC430-W240 is not XM430-W210.
+    # With two wrong characters, a servo's name is another's: XC430-W240 is not XM430-W210.
     cutoff = 0.85 if any(each.isdigit() for each in bare) else 0.75
     near = [bare] if bare in plain else difflib.get_close_matches(bare, long, n=1, cutoff=cutoff)
     return plain[near[0]] if near else ""

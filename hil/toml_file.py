@@ -12,7 +12,7 @@ from typing import Any
 from hil.description.regular_file import not_a_file
 
 MOST_BYTES = 4_000_000
-"""Largest size of a file: reading one takes seconds per megabyte of numbers."""
+"""Largest size of a file [bytes]: reading takes seconds per megabyte of numbers."""
 
 
 class TomlFileError(ValueError):

@@ -114,8 +114,8 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     if (drive_mode := unsuitable_drive_mode(servo)) is not None:
         raise WrongSetting(
             f"{joint.title}: Drive Mode is {drive_mode} but must be 0 (no reverse, no torque on by goal "
-            "update). Set it with DYNAMIXEL Wizard 2.0; if it reversed the servo, determine `direction` and zero_ticks "
-            "again."
+            "update). Set it with DYNAMIXEL Wizard 2.0; if the servo was reversed, determine `direction` and "
+            "zero_ticks again."
         )
     if offset := ignored_homing(servo):
         raise WrongSetting(f"{joint.title}: Homing Offset is {offset}. {APPLY_HOMING}.")

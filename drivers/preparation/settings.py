@@ -40,11 +40,11 @@ Other writable EEPROM registers are not restored:
 """
 
 EEPROM = ("Operating Mode", "Current Limit", *PROTECTIVE)
-"""EEPROM registers to restore, in this order: Operating Mode comes first because it resets RAM, and because a goal in
-current mode is torque.
+"""EEPROM registers to restore, in this order: Operating Mode comes first because changing it resets RAM, and because a
+goal in current mode is torque.
 """
 
-# Not in it: LED, which only shines; Torque Enable, which is cut; Goal Position (see above).
+# Not restored: LED, which only shines; Torque Enable, which is cut; Goal Position (see above).
 _GAINS = (
     "Velocity I Gain",
     "Velocity P Gain",
@@ -60,7 +60,7 @@ _GOALS = ("Goal PWM", "Goal Current", "Goal Velocity")
 
 RAM = (STATUS_LEVEL, *_GAINS, *_GOALS)
 """Registers in RAM to restore. Status Return Level comes first, so that the other writes are confirmed; goals come
-last, when mode and limits are those that they belong to.
+last, once the mode and limits are those to which they belong.
 """
 
 _BOUNDS = {
@@ -119,9 +119,9 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
     """Restore the registers that differ from `settings`; return their old and new values by name.
 
     Goals are restored as far as the servo's limits allow (`attainable`), and only if torque is still off and the mode
-    and the limits are those that the goals belong to: in current mode, the former goal of a position-controlled servo
-    is full torque. The Bus Watchdog, which may be all that stops the motor, is cleared no earlier. Each register is
-    read back.
+    and limits are those to which the goals belong: in current mode, the former goal of a position-controlled servo is
+    full torque. The Bus Watchdog is cleared no earlier, since it may be all that stops the motor. Each register is read
+    back.
 
     Raises WrongSetting if torque is on, and TorqueDoubted if EEPROM is locked although torque reads back as off. Raises
     the errors of `Servo.write` only after all other registers have been tried; the error then has the registers
@@ -169,15 +169,15 @@ def _refuse_torque(servo: Servo) -> None:
 
 
 def _doubted(servo: Servo, failures: Mapping[str, DriverError]) -> TorqueDoubted:
-    """Arm the watchdog of a servo that locks its EEPROM, so that it stops as soon as the bus is silent, unless it has
-    tripped already; return the error.
+    """Arm the watchdog of a servo that locks its EEPROM, unless it has tripped already, so that the servo stops as
+    soon as the bus is silent; return the error.
     """
     with suppress(DriverError):
         if servo.read_despite_error("Bus Watchdog") != WATCHDOG_TRIPPED:
             servo.write_despite_error("Bus Watchdog", 1)
     return TorqueDoubted(
-        f"{servo.title}: its Torque Enable reads 0, but it refuses to change {' and '.join(failures)}, as it does only "
-        "with torque on."
+        f"{servo.title}: its Torque Enable reads 0, but it refuses to change {' and '.join(failures)}, as servos do "
+        "only with torque on."
     )
 
 

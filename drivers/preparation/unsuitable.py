@@ -1,4 +1,4 @@
-"""Register values that rule out an experiment: looked for at set-up, by the check before a run, and at its start."""
+"""Register values that rule out an experiment: checked at set-up, by `hil check`, and at the start of a run."""
 
 from hil.drivers.servo import Servo
 
@@ -11,10 +11,10 @@ _MOST_HOMING_TICKS = 1024
 
 APPLY_HOMING = (
     f"Position Control Mode ignores an offset beyond +-{_MOST_HOMING_TICKS} ticks, but current and PWM mode apply it, "
-    "so the joint's angle would change when a run begins. Set Operating Mode to 4 (Extended Position), which applies "
-    "it too, or clear Homing Offset, with DYNAMIXEL Wizard 2.0; then determine zero_ticks again"
+    "so the joint's angle would change when a run begins. With DYNAMIXEL Wizard 2.0, set Operating Mode to 4 (Extended "
+    "Position), which applies it too, or clear Homing Offset; then determine zero_ticks again"
 )
-"""What is wrong with an `ignored_homing`, and how to fix it; a full stop or further words follow."""
+"""Explanation of and remedy for an `ignored_homing`; the caller adds further words or the full stop."""
 
 
 def unsuitable_drive_mode(servo: Servo) -> int | None:

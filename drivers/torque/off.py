@@ -40,7 +40,7 @@ _REPEATS, _REPEAT_S = 2, 0.001
 """Number of further torque-off packets and the time between them [s]: a packet that collides with a reply is lost."""
 
 _READINGS = 3
-"""Number of times that Torque Enable is read until its readings agree."""
+"""Maximum number of attempts to read Torque Enable twice alike."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class TorqueOff:
         on: joints whose servos' torque is on again each time it is cut. silent: joints whose servos have not
         answered since.
         """
-        why = "Another program had switched its torque on again, and its answers since are missing or contradictory."
+        why = "Another program had switched torque on again; the servo's later answers are missing or contradictory."
         return replace(
             self,
             confirmed=tuple(joint for joint in self.confirmed if joint not in {*on, *silent}),
@@ -286,7 +286,7 @@ def has_torque(servo: Servo) -> bool | None:
     """Read whether a servo's torque is on; None if its answers may belong to other requests.
 
     A reply does not identify its register, so Torque Enable is read twice, with another register in between, and again
-    if another program has changed it meanwhile. Raises the errors of `Servo.read`.
+    if the readings disagree, e.g. because another program has changed it. Raises the errors of `Servo.read`.
     """
     for _ in range(_READINGS):
         first = servo.read_despite_error("Torque Enable")

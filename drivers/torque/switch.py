@@ -197,14 +197,14 @@ class TorqueSwitch:
             raise interrupts[0]
 
     def report_doubted(self, drive: Joint, why: str) -> None:
-        """Record in `torque_off_report` that a servo (a key of `drives`) does not behave as without torque."""
+        """Record in `torque_off_report` that a servo (a key of `drives`) does not behave as if its torque were off."""
         report = self.torque_off_report or TorqueOff(tuple(self._servos), ())
         self.torque_off_report = report.with_doubted(drive, why)
 
     def report_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> None:
         """Record in `torque_off_report` that another program keeps torque on (`TorqueOff.with_driven`).
 
-        A servo that is still in the mode of this program gets a goal of 0, since its goal would be this program's.
+        A servo still in this program's mode gets a goal of 0, or it would follow this program's last goal.
         """
         for drive in on:
             with suppress(DriverError):

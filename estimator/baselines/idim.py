@@ -93,7 +93,7 @@ def filtered_rows(
 
     filter_ = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
     tau = sosfiltfilt(filter_, torque, axis=1)
-    # As bytes, which are compared in an instant: arrays have no hash.
+    # As bytes, which can be hashed and are compared fast; arrays cannot be hashed.
     given = position.tobytes(), position.shape[0], dt, cutoff, position_cutoff or cutoff, coulomb_width
     Y = _filtered_regressor(*given, trim, keep)
     if more is not None:

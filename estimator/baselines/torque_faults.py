@@ -21,7 +21,7 @@ from hil.estimator.errors import EstimationError
 BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
 """Clipping levels to try, each given as the fraction of samples that exceed it."""
 OUTERMOST = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4])
-"""Places of a stop to try, each given as the fraction of samples beyond it."""
+"""Angles of a stop to try, each given as the fraction of samples beyond it."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
 LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
@@ -132,7 +132,7 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
 
 
 def suspect_stop(recordings: Sequence[Recording]) -> Stop | None:
-    """Return the stop that explains the motion much better than the torque alone, and better than springs."""
+    """Return the stop that explains the motion much better than the torque alone and than springs, or None."""
     joints = recordings[0].joints
     given, sprung = _residuals(recordings), _residuals(recordings, _springs)
     if given is None or sprung is None:
@@ -153,14 +153,14 @@ def suspect_stop(recordings: Sequence[Recording]) -> Stop | None:
 
 
 def _pressing(joint: int, at: float, side: int, positions: Array) -> Array:
-    """Return the column of a stop's stiffness (joints, samples, 1)."""
+    """Return the regressor's column for a stop (joints, samples, 1)."""
     column = np.zeros((*positions.shape, 1))
     column[joint, :, 0] = side * np.maximum(side * (positions[joint] - at), 0.0)
     return column
 
 
 def _springs(positions: Array) -> Array:
-    """Return the columns of a spring on each joint (joints, samples, joints)."""
+    """Return the regressor's columns for a spring on each joint (joints, samples, joints)."""
     return positions[:, :, None] * np.eye(len(positions))[:, None, :]
 
 

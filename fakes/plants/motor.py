@@ -98,7 +98,7 @@ class Motor:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the drive has only lag, torque, offset and Stribeck friction, with stiction or smooth."""
+        """Whether the drive has only lag, torque, offset and Stribeck friction, smooth or with stiction."""
         return not (self._shaped or self.bristle_stiffness or self.jammed or self.held_at is not None)
 
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:

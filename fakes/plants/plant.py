@@ -112,7 +112,7 @@ _searched: list[str] = []
 def load_plant(name: str, options: Mapping[str, object], folder: Path | None = None) -> Plant:
     """Create a plant by calling `module:factory` with these options; raises PlantError.
 
-    Factories outside `OWN_PLANTS` require `allow_code`. folder: where else to look for the module.
+    Factories outside `OWN_PLANTS` require `allow_code`. folder: a further folder in which to look for the module.
     """
     if name not in OWN_PLANTS and not _leave["code"]:
         raise PlantError(
@@ -134,7 +134,7 @@ def load_plant(name: str, options: Mapping[str, object], folder: Path | None = N
         raise PlantError(text) from error
     found = Path(getattr(module, "__file__", None) or "")
     if folder and folder != found.parent and str(found.parent) in _searched and (folder / found.name).is_file():
-        raise PlantError(f'plant = "{name}" is that of {found} in this process, not that in {folder}; rename one')
+        raise PlantError(f'plant = "{name}" is the one in {found} in this process, not in {folder}; rename one')
     try:
         plant = factory(**options)
     except PlantError:

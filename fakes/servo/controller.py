@@ -196,7 +196,7 @@ class Controller:
 
 
 def _shape(away: float, velocity: float, fastest: float, hardest: float) -> int:
-    """Return the bits of Moving Status for a move of `away` ticks: a triangle never reaches its velocity limit.
+    """Return the bits of Moving Status for a move of `away` ticks: a triangular one stays below its velocity limit.
 
     velocity: at the start [ticks/ms]. fastest, hardest: as returned by `profile`.
     """

@@ -7,8 +7,8 @@ the behaviour that demands more of a client: see "Conformance" in docs/fake-bus.
   Length error; other violations cause an Access error. A read may begin inside a register; undefined bytes between two
   registers read as 0. A read that begins or ends at an undefined address causes an Access error.
 - When the Bus Watchdog trips, the goal of the operating mode stops the motor: Goal Current, Goal PWM or Goal Velocity
-  becomes 0, or Goal Position becomes Present Position, where the servo goes on holding. The goals that only limit other
-  modes remain, and torque stays enabled. The watchdog's register then accepts only 0.
+  becomes 0, or Goal Position becomes Present Position, which the servo continues to hold. The goals that only act as
+  limits in this mode remain, and torque stays enabled. The watchdog's register then accepts only 0.
 - At power-up, and after a change of Operating Mode, Goal Current and Goal PWM equal their limits: if a client enables
   torque in current mode without first writing a goal, full current flows. Goal Velocity is 0.
 
@@ -439,7 +439,7 @@ class EmulatedServo(Powered):
         accepts = bool(self.model.operating_modes) and not by_goal and watchdog != WATCHDOG_TRIPPED
         self._goal_pwm_limit = memory.get("PWM Limit") if accepts and "Goal PWM" in memory else -1
         """Largest Goal PWM on the fast path [ticks]; -1 if the general path is used."""
-        # The fast path bypasses the controller, which limits the current by the supply or, in one mode, by the goal.
+        # The fast path bypasses the controller, in which the supply or, in one mode, the goal limits the current.
         by_controller = self._voltage_limited or self._mode == CURRENT_POSITION_MODE
         self._takes_goal_current = accepts and not by_controller and self._current_limit >= 0
         if self.needs_ticks:

@@ -166,7 +166,7 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
     except BaseException as stopped:
         if not run.discard_if_unused():
             if isinstance(stopped, RunFolderError):
-                stopped.exit_code = 1  # the disk became full, or the folder was lost: the input was right
+                stopped.exit_code = 1  # the disk became full, or the folder was lost: the input was valid
             with suppress(Exception):  # a failing hint must not hide what stopped the arm, or its torque state
                 for line in _how_to_go_on(stopped, run, command, shown):
                     stopped.add_note(line)

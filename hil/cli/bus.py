@@ -147,7 +147,7 @@ def setup(
         if each is not None:
             _check_baud(each)
     if return_delay_us is not None and return_delay_us % RETURN_DELAY_UNIT_US:
-        raise typer.BadParameter(f"--return-delay-us {return_delay_us}: servos take even values from 0 to 508 only.")
+        raise typer.BadParameter(f"--return-delay-us {return_delay_us}: servos accept only even values from 0 to 508.")
     if json_only and not yes:
         raise typer.BadParameter("--json cannot ask for confirmation: add --yes.")
     opened = open_port(port_url(port), baud)

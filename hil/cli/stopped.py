@@ -18,7 +18,7 @@ import typer
 from hil.next_step import next_step
 
 _LOADERS, _LATER_S = frozenset({"importlib", "_frozen_importlib", "numba", "llvmlite"}), 0.02
-"""Packages whose work a signal does not interrupt, and the time after which it is repeated [s]."""
+"""Packages whose code a signal does not interrupt, and the time after which the signal is repeated [s]."""
 
 
 class Terminated(KeyboardInterrupt):
@@ -60,16 +60,16 @@ def same_again(stopped: BaseException) -> list[str]:
 
 
 def _catch() -> dict[signal.Signals, Any]:
-    """Catch the signals; leave those that are already handled or ignored (nohup)."""
+    """Catch the three signals, except those that are already handled or ignored (nohup)."""
     signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     caught = [each for each in signals if signal.getsignal(each) in (signal.SIG_DFL, signal.default_int_handler)]
     return {each: signal.signal(each, _raise) for each in caught}
 
 
 def _raise(number: int, frame: FrameType | None) -> None:
-    """Raise Terminated, but not before modules are loaded.
+    """Raise Terminated, but not while modules are being loaded.
 
-    In callbacks of compiled modules that are being loaded, Python ignores exceptions: the stop would be lost.
+    Python ignores exceptions in callbacks of compiled modules that are being loaded: the stop would be lost.
     """
     inner = frame
     while inner is not None:

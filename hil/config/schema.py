@@ -425,7 +425,7 @@ def port_url(port: str) -> str:
     """The URL of a port.
 
     `port` is a URL or device, which is returned unchanged; a TOML file; or the name of a fake arm for other programs
-    (`koch`) or else of a bundled configuration. Raises ConfigError.
+    (`koch`) or, if there is none, of a bundled configuration. Raises ConfigError.
     """
     url = _url_of(port)
     fakes.register_for(url)
@@ -442,7 +442,7 @@ def _is_only_fake(path: Path) -> bool:
 
 
 def config_of(port: str) -> Path | None:
-    """The configuration that `port`, as given to `port_url`, means; None for a URL, a device or a fake arm."""
+    """The configuration that `port` (see `port_url`) refers to; None for a URL, a device or a fake arm."""
     if "://" in port or find_arm(port).parent == ARMS:
         return None
     config = find_config(Path(port))

@@ -75,8 +75,8 @@ class Prediction:
         return self._value_at(self._simultaneous())
 
     def reached_with(self, chance: float) -> Array:
-        """Peaks (quantities, joints) that are exceeded with a total probability of `chance`, or the worst arm's if they
-        are farther from rest.
+        """Peaks (quantities, joints) that are exceeded with a total probability of `chance`, or the worst arm's if
+        they are farther from rest.
         """
         foreseen = self._value_at(NormalDist().inv_cdf(1.0 - chance / (2 * GUARDED)))
         worst = np.take_along_axis(self.values, self.shares.argmax(axis=0)[None], axis=0)[0]
@@ -84,7 +84,7 @@ class Prediction:
         return np.where(is_farther, worst, foreseen)
 
     def is_beyond(self, quantity: int, joint: int, value: float) -> bool:
-        """Whether a peak exceeds its limit."""
+        """Whether a peak reaches or exceeds its limit."""
         limit, origin = self.limits[quantity, joint], self.origin[quantity, joint]
         return bool((value - limit) * (limit - origin) >= 0.0)
 

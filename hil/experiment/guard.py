@@ -47,7 +47,7 @@ may be rejecting its goals.
 """
 
 NONE_HEARD, LOST = "No servo was heard", "Requests or replies are lost"
-"""Beginnings of the explanation if the arm is stopped because no servo replies, or because one does not."""
+"""Beginnings of the explanations of a stop because no servo replies, and because one does not."""
 
 
 class Guard:

@@ -224,8 +224,8 @@ def _try_again(bus: ServoBus, note: Note) -> None:
 
 
 def _why_silent(bus: ServoBus, stop: SafetyStop) -> str:
-    """Say that replies were late if they arrived once torque was cut. If no servo was heard, say which ones answered
-    then: a silent servo hides those after it.
+    """Say that replies were late if they arrived once torque was cut. Otherwise, if no servo was heard, say which ones
+    answered then: a silent servo hides those after it.
     """
     report = bus.torque_off_report
     if stop.cause is not Cause.MISSING or report is None:

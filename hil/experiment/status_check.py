@@ -36,7 +36,7 @@ _REMEMBERED = 256
 """Number of latest goals kept."""
 
 _LONGEST_DELAY_S = 0.1
-"""Longest delay of requests that is taken for one [s]; an older goal that a servo seems to hold is a coincidence."""
+"""Longest delay that requests are assumed to have [s]; if a servo seems to hold an older goal, it is a coincidence."""
 
 _HELD_BEFORE = 4
 """If writes are lost, a servo may also hold one of the last `_HELD_BEFORE` goals sent before a status last matched."""
@@ -176,7 +176,7 @@ class StatusCheck:
                 )
             if late * self._interval <= _LONGEST_DELAY_S:
                 return Cause.GOALS_LOST, (
-                    f"receives goals {cycles} late: by its own clock its replies are recent. A device between adapter "
+                    f"receives goals {cycles} late: by its own clock, its replies are recent. A device between adapter "
                     "and servo delays requests. Check the adapter, its latency and its cable."
                 )
         unit = self._unit[joint]
@@ -190,7 +190,7 @@ class StatusCheck:
         return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {self.why_lost()}"
 
     def _is_recent(self, joint: int, late: int) -> bool:
-        """Whether the servo's clock contradicts replies that are `late` cycles old: it shows delays of several ms."""
+        """Whether the servo's clock, which shows delays of several ms, rules out replies that are `late` cycles old."""
         readings, stale = self._clock[joint][2:]
         return readings >= _LEARNT_READINGS and not stale and late * self._interval > 2 * _CLOCK_TOLERANCE_S
 

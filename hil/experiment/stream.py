@@ -302,9 +302,9 @@ class Stream:
             )
         if drifts:
             return (
-                f"{self._bus.joints[self._repetition.worst].title} changes most ({listed}): friction may hold it for "
-                "part of each period, or its torque may have changed. Raise its peak_torque, or check its supply, "
-                "cable and coupling."
+                f"{self._bus.joints[self._repetition.worst].title} changes most ({listed}): friction may hold it "
+                "during part of each period, or its torque may have changed. Raise its peak_torque, or check its "
+                "supply, cable and coupling."
             )
         return (
             f"The change decreases from period to period ({listed}), by a factor of {decay.ratio:.2g} each time: the "
@@ -330,7 +330,7 @@ class Stream:
     def _more_torque(self) -> str:
         if self._config.is_chain:
             return "raise experiment.rate, at which a stiffer stabiliser moves it, or widen position_limit"
-        if self._config.experiment.pilot:  # which chooses the torque
+        if self._config.experiment.pilot:  # the pilot chooses the torque
             return "widen position_limit or raise the lower end of experiment.band, so that more torque is safe"
         return "raise experiment.peak_torque"
 

@@ -51,8 +51,8 @@ def identify_in_steps(
 
 
 def _full(search: Search, config: Config, found: Amplitude) -> Played:
-    """Play the full run; repeat it with less torque if it exceeded a limit, and with other waves if it did not settle,
-    and at higher frequencies if friction held a joint.
+    """Play the full run; repeat it with less torque if it exceeded a limit, with other waves if it did not settle, and
+    at higher frequencies if friction held a joint.
 
     Friction may stop an arm in a different place in every period, however long it moves, so each repetition tolerates a
     larger difference. The fit does not need equal periods, and the verdict says how well they are predicted.
@@ -80,8 +80,8 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
                 experiment = search.config.experiment.model_copy(update={"band": band})
                 search.config = search.config.model_copy(update={"experiment": experiment})
                 say(
-                    "At higher frequencies more torque is safe, and friction does not hold the arm: the waves now have "
-                    f"{band[0]:g} to {band[1]:g} Hz."
+                    "At higher frequencies, more torque is safe and friction does not hold the arm: the waves now "
+                    f"cover {band[0]:g} to {band[1]:g} Hz."
                 )
             config = search.held
             plan = search.waves(config)
@@ -105,10 +105,10 @@ def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -
 
 
 def _faster(config: Config, max_low: float) -> list[float]:
-    """The experiment's band, beginning at a higher frequency, at most `max_low` times its upper end [Hz]; [] if there
-    is no such band.
+    """The experiment's band with its lower end raised, to at most `max_low` times the upper end [Hz]; [] if it cannot
+    be raised.
 
-    With static friction far above that of motion, a torque that moves the joint slowly moves it too far.
+    If static friction far exceeds kinetic friction, a torque that moves the joint at low frequencies moves it too far.
     """
     experiment = config.experiment
     if experiment.band is None:

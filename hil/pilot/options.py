@@ -77,10 +77,10 @@ class PilotOptions:
     """
 
     max_full_runs: int = 6
-    """Maximum number of full runs if one exceeds a limit or does not settle; each has less torque than the last."""
+    """Maximum number of full runs if one exceeds a limit or does not settle."""
     max_unlike_runs: int = 3
     """Maximum number of full runs that may end because one period differed from the one before."""
     max_low: float = 0.35
-    """Highest lower end of experiment.band that a repeated full run uses, as a fraction of the upper end."""
+    """Largest lower end of experiment.band that a repeated full run uses, as a fraction of its upper end."""
     max_settle_within: float = 0.1
     """Largest experiment.settle_within that a repeated full run accepts."""

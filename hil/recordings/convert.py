@@ -45,7 +45,7 @@ class Converted:
 
 
 _FEWEST_IN_A_SEGMENT = 6
-"""Fewest samples in a segment: its initial state alone takes two per joint."""
+"""Fewest samples in a segment: its initial state alone has two unknowns per joint."""
 
 
 def convert(table: Table, columns: Columns) -> Converted:

@@ -92,7 +92,7 @@ def _flat(name: str, column: Any, feature: dict[str, Any]) -> dict[str, Values]:
 
 
 def _from_text(name: str, texts: list[str | None]) -> dict[str, Values]:
-    """Convert a column of numbers that were stored as text; return none if any of it is not a number."""
+    """Convert a column of numbers stored as text; return no column if any entry is not a number."""
     try:
         return {name: np.array([np.nan if not text else float(text) for text in texts])}
     except ValueError:

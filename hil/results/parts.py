@@ -245,7 +245,7 @@ class StreamTiming:
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """Duration of the estimation [s], which does not count when results are compared."""
+    """Duration of the estimation [s], which is ignored when results are compared."""
 
     estimation_seconds: float = field(compare=False)
 

@@ -149,7 +149,7 @@ class Recorder:
     def close(self) -> None:
         """Truncate the file to the recorded rows; may be called repeatedly.
 
-        Raises RunFolderError if this fails, or if the file was removed or renamed in the meantime; its rows are then
+        Raises RunFolderError if this fails. If the file was removed or renamed in the meantime, its rows are first
         saved in a new file, with the configuration and the other files that were there when the recording began.
         """
         if self._bytes.nbytes == 0:
@@ -168,7 +168,7 @@ class Recorder:
             )
         else:
             return
-        lost.exit_code = 1  # the input was right
+        lost.exit_code = 1  # the input was valid
         raise lost from None
 
     def _save_again(self) -> RunFolderError:

@@ -43,7 +43,7 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
             raise ExperimentError(f"{servo.title} still has its torque on. Power-cycle it, then start again.")
     if modes := [f"{one.title}: {mode}" for one in handles if (mode := unsuitable_drive_mode(one)) is not None]:
         raise ExperimentError(
-            f"Drive Mode must be 0, or directions and zeros measured now would be wrong later ({'; '.join(modes)}). "
+            f"Drive Mode must be 0; otherwise directions and zeros found now will be wrong later ({'; '.join(modes)}). "
             "Set it to 0 with DYNAMIXEL Wizard 2.0, then run the same command again."
         )
     if homing := [f"{one.title}: {offset}" for one in handles if (offset := ignored_homing(one))]:

@@ -278,7 +278,7 @@ def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: S
     torque = servo.read("Torque Enable")
     fix = "Another program is driving it: stop that program first, or power-cycle the servo."
     if torque and servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
-        fix = "A program that has ended left it on, and its watchdog has tripped. Power-cycle the servo."
+        fix = "A program that has ended left it on, and the servo's watchdog has tripped. Power-cycle the servo."
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
 
 
@@ -290,7 +290,7 @@ def _drive_mode(config: Config, _joint_config: JointConfig, _joint: Joint, servo
     )
     if drive_mode & 1:
         fix += (
-            f" Then `direction` and zero_ticks are no longer right: determine them again, with {_finds_zeros(config)}."
+            f" Then `direction` and zero_ticks are no longer valid: determine them again, with {_finds_zeros(config)}."
         )
     return _graded(unsuitable_drive_mode(servo) is None, "drive mode", str(drive_mode), fix)
 

@@ -183,7 +183,7 @@ def inertias(arms: ChainArms, poses: Array) -> tuple[Array, Array]:
             place(rotation, translation, axis, pose, work[0], work[1])
             move(link, armature, still, work)
             matrix[:] = work[4]
-        # The sum of a column of np.cumsum, unlike that of np.sum, does not depend on how many columns there are.
+        # Unlike np.sum, np.cumsum rounds a column's sum in the same way, however many columns there are.
         held[arm] = np.cumsum(np.diagonal(mass, axis1=1, axis2=2) / len(poses), axis=0)[-1]
         free[arm] = (1.0 / np.diagonal(linalg.inv(mass), axis1=1, axis2=2)).min(axis=0)
     return held, free

@@ -1,4 +1,4 @@
-"""Questions to the person at the terminal. Ctrl-C stops the command as it does elsewhere."""
+"""Questions to the user at the terminal. Ctrl-C stops the command as it does elsewhere."""
 
 from collections.abc import Callable
 from typing import TypeVar

@@ -74,10 +74,10 @@ def _stopped_or_clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
         return _clipped(recordings, clipped)
     than = "above" if stop.side > 0 else "below"
     return (
-        f"Joint {stop.joint} seems to press against something that yields, a stop, a cable or an object, {than} about "
+        f"Joint {stop.joint} seems to press against something that yields (a stop, a cable or an object) {than} about "
         f"{stop.at:.3g} rad: with a stiffness of {stop.stiffness:.2g} N m/rad there, inverse dynamics leaves "
         f"{100 * stop.residual:.2g} % of the torque unexplained instead of {100 * stop.residual_given:.2g} %. Record "
-        "motion that stays clear of it.",
+        "a motion that does not reach it.",
     )
 
 

@@ -31,7 +31,7 @@ Lag and scale error are properties of a servo and do not change. A lag that chan
 (`hil.experiment.velocity.lag`). Once the motion has revealed lag and scale error, up to twice the estimated values are
 accepted, plus `MORE_LAG_S` and `MORE_SCALE` and twice their standard deviations.
 
-Part of the compiled loop `joint_checks`; a record of type `MEMORY` is a joint's state.
+Part of the compiled loop `joint_checks`; a record of type `MEMORY` holds a joint's state.
 """
 
 from collections.abc import Iterable
@@ -202,7 +202,7 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
     curved = CURVED * seconds * turned
     if short.far == 0.0 and short.curved == 0.0:
         curved = max(curved, CURVED_AT_FIRST * 0.5 * seconds * abs(before + velocity))
-    # A late measurement takes from the next interval what it adds to its own.
+    # A late measurement shortens the next interval by as much as it lengthens its own.
     at_both_ends = unknown + also_unsure * abs(before)
     known = LAG_S * turned + SCALE * abs(moved) + curved + at_both_ends
     if _has_jumped(memory.steps, abs(difference) - known, seconds):
@@ -283,7 +283,7 @@ def _looks_long(memory: Any, velocity: float) -> bool:
     moved, difference, unknown = memory.moved, memory.difference, memory.unknown
     _add(long, LONG_S, moved, difference, velocity, seconds, memory.most_curved, unknown)
     _add(slow, SLOW_S, moved, memory.seen, velocity, seconds, memory.most_curved, 0.0)
-    slow.unknown = long.unknown  # as above: what a late measurement adds does not remain
+    slow.unknown = long.unknown  # as above: the next interval cancels the error
     fades = min(seconds / SLOW_S, 1.0)
     memory.heading += memory.headed - fades * memory.heading
     memory.moving -= fades * memory.moving

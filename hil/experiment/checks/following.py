@@ -26,7 +26,7 @@ A current sensor may be noisier than assumed. Its noise is measured at constant 
 start (`current_noise`), and is a lower bound on sigma: a noisy reading then means that lost torque is found later, not
 that a healthy motor is stopped.
 
-Part of the compiled loop `joint_checks`; a record of type `MEMORY` is a joint's state.
+Part of the compiled loop `joint_checks`; a record of type `MEMORY` holds a joint's state.
 """
 
 from typing import Any

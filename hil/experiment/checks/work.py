@@ -3,7 +3,7 @@
 Work is checked only without a stabiliser. Without one, the arm starts at a stable rest pose and cannot return more work
 than was put in. A motor that keeps taking work out of it therefore turns the wrong way.
 
-Part of the compiled loop `joint_checks`; a record of type `MEMORY` is a joint's state.
+Part of the compiled loop `joint_checks`; a record of type `MEMORY` holds a joint's state.
 """
 
 from typing import Any

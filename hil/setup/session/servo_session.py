@@ -168,7 +168,7 @@ class ServoSession:
     def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
         """Cut torque where it is on and restore these servos' settings; return whether there was anything to do.
 
-        If it has been switched on before, it is watched for WATCH_S: a single reading may come between two switches.
+        If torque has been switched on again before, it is watched for WATCH_S: a single reading may come too early.
 
         failed: receives the errors of the servos whose settings could not be restored.
         """
@@ -256,9 +256,9 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
 
 
 def _end(session: ServoSession, stopped: BaseException | None) -> None:
-    """Restore the settings, and tell with the exception that ends the session what could not be restored.
+    """Restore the settings, and report what could not be restored with the exception that ends the session.
 
-    A signal that arrives meanwhile ends the session instead of `stopped`, with the same notes.
+    A signal that arrives meanwhile ends the session in place of `stopped`, with the same notes.
     """
     bus, before = session.bus, session.bus.torque_off_report
     left: list[str] = []

@@ -355,7 +355,7 @@ def test_setup_reports_the_units_that_it_asks_in(arm_file: ArmFile) -> None:
 def test_an_odd_return_delay_is_refused(arm_file: ArmFile) -> None:
     result = invoke("setup", arm_file(), "--id", 2, "--yes", "--return-delay-us", 3)
     assert result.exit_code == 2
-    assert "--return-delay-us 3: servos take even values from 0 to 508 only." in " ".join(result.output.split())
+    assert "--return-delay-us 3: servos accept only even values from 0 to 508." in " ".join(result.output.split())
 
 
 @pytest.mark.parametrize("kind", ["lost_reply", "corrupted_reply", "lost_instruction", "truncated_reply"])

@@ -75,7 +75,7 @@ def test_a_servo_whose_watchdog_has_tripped_is_not_said_to_be_driven(arm: Arm, b
     bench.servos[1].write(64, b"\1")
     bench.servos[1].trip_watchdog()
     torque = next(each for each in check_arm(config) if each.what == "torque")
-    assert torque.level is Level.STOP and "its watchdog has tripped" in torque.fix
+    assert torque.level is Level.STOP and "the servo's watchdog has tripped" in torque.fix
 
 
 def test_threads_that_save_at_once_and_a_folder_removed_meanwhile_are_no_error(
