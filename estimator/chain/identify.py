@@ -195,7 +195,32 @@ def _best_fit(
             narrow = replace(options, initial_width=width)
             again = fit_periods(periods, model, linear, prior, narrow, added, best)
             best = again if _worst_residual(periods, again) < before else best
+    before = _worst_residual(periods, best)
+    if before > options.far and not model.zeros and model.joints > 1:
+        with suppress(ConvergenceError):
+            again = _around(periods, model, prior, options, added, best)
+            best = again if _worst_residual(periods, again) < before else best
     return best
+
+
+def _around(
+    periods: Sequence[SettledPeriod],
+    model: ChainModel,
+    prior: Prior,
+    options: ChainOptions,
+    added: Sequence[Array | None],
+    stuck: ChainFit,
+) -> ChainFit:
+    """Fit with free encoder zeros first, whose further directions may lead out of the valley in which `stuck` ended;
+    then fit `model` from there.
+    """
+    wider = replace(model, zeros=True)
+    freed = fit_periods(periods, wider, fit_lines(periods, wider, prior, added), prior, options, added)
+    value = dict(zip(wider.names, freed.value.tolist(), strict=True))
+    near = replace(freed, value=np.array([value[name] for name in model.names]))
+    narrow = replace(options, initial_width=options.other_initial_widths[-1])
+    fitted = fit_periods(periods, model, fit_lines(periods, model, prior, added), prior, narrow, added, near)
+    return replace(fitted, iterations=fitted.iterations + stuck.iterations)
 
 
 def _worst_residual(periods: Sequence[SettledPeriod], fit: ChainFit) -> float:

@@ -214,6 +214,29 @@ def test_a_fit_does_not_start_again_from_its_own_minimum(setup: bench.Setup, mon
     assert tried == [(0.03, None), (0.001, 0.004)]
 
 
+@pytest.mark.parametrize("last", [0.29, 3.0])
+def test_a_fit_far_from_any_explanation_is_repeated_by_way_of_free_zeros(
+    setup: bench.Setup, monkeypatch: pytest.MonkeyPatch, last: float
+) -> None:
+    """The restart begins with the values found beside free zeros, and is kept only if it explains more."""
+    period, model, tried = sticking(1), ChainModel(setup.base), []
+    freed = {name: 0.1 * number for number, name in enumerate(replace(model, zeros=True).names)}
+
+    def fit(*given: Any) -> ChainFit:
+        tried.append((given[1].zeros, given[6] if len(given) > 6 else None))
+        off = (2.0, 0.3, last)[len(tried) - 1]
+        names = given[1].names
+        return replace(fit_of(setup, period, 0.0009, off), value=np.array([freed[name] for name in names]))
+
+    monkeypatch.setattr(identify, "fit_periods", fit)
+    no_widths = replace(DEFAULTS, other_initial_widths=(10.0,))
+    found = identify._best_fit([period], model, fit_lines([period], model, setup.prior), setup.prior, no_widths, ())
+    assert [zeros for zeros, _ in tried] == [False, True, False]
+    np.testing.assert_array_equal(tried[2][1].value, [freed[name] for name in model.names])
+    off = min(last, 2.0)
+    assert found.positions[0][0, 0] == pytest.approx(period.position[0, 0] + off * bench.TICK)
+
+
 def test_a_restart_keeps_all_but_wide_coulomb_steps(setup: bench.Setup) -> None:
     problem, _ = problem_of(setup, sticking(1))
     names = problem.coordinates.names
