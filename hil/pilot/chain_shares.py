@@ -332,7 +332,7 @@ def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
         helps.append(
             f"more accurate masses in the URDF ([arm.prior] spread = {share * spread:.2g} instead of {spread:g})"
         )
-    return f"What helps: {'; '.join(helps)}"
+    return f"What helps, alone or together: {'; '.join(helps)}"
 
 
 def _too_soft(peaks: Prediction) -> float:
