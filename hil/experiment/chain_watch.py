@@ -37,8 +37,10 @@ friction of up to twice the mean from raising an alarm.
 """
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
-_IMPACT_S = 0.1
-"""How long a joint that has come back to its rest angle may bounce off a stop [s]."""
+_IMPACT_S, _MOST_REBOUND = 0.05, 0.3
+"""How long a joint that has come back to its rest angle may bounce off a stop [s], and its largest speed then, relative
+to the speed before.
+"""
 WINDOW_S = 0.3
 """Time span [s] of the torque range that a message about a stationary joint states."""
 
@@ -78,8 +80,10 @@ class ChainWatch:
         self._commanded: deque[tuple[State, Array]] = deque(maxlen=math.ceil(WINDOW_S / interval))
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
-        self._velocity, self._came_at = np.zeros(n), np.full(n, -np.inf)
-        """Latest velocities [rad/s], and when each joint last moved towards a stop near its rest angle [s]."""
+        self._velocity = np.zeros(n)
+        """Latest velocities (joints,) [rad/s]."""
+        self._hit_at, self._hit_speed = np.full(n, -np.inf), np.zeros(n)
+        """When each joint may last have hit a stop near its rest angle [s], and its speed before [rad/s]."""
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
@@ -119,9 +123,13 @@ class ChainWatch:
         """
         may_lie = ~self._was_below & ~self._was_above & (torque * self._falls_to <= self._friction)
         towards = np.where(may_lie, self._falls_to, self._was_below * 1.0 - self._was_above * 1.0)
-        self._came_at = np.where(~is_away & (self._velocity * towards > _STILL_RAD_S), self._seen_at, self._came_at)
-        is_home = ~is_away & ((np.abs(velocity) <= _STILL_RAD_S) | (self._seen_at - self._came_at <= _IMPACT_S))
+        approach, before = velocity * towards, self._velocity * towards
+        hits = ~is_away & (before > _STILL_RAD_S) & (approach < before)  # a stop can only slow a joint down
+        self._hit_at = np.where(hits, self._seen_at, self._hit_at)
+        self._hit_speed = np.where(hits, before, self._hit_speed)
+        bounces = (self._seen_at - self._hit_at <= _IMPACT_S) & (-approach <= _MOST_REBOUND * self._hit_speed)
         self._velocity = velocity
+        is_home = ~is_away & ((np.abs(velocity) <= _STILL_RAD_S) | bounces)
         return np.asarray(is_home * towards)
 
     def _raise(self, joint: int, state: State) -> None:

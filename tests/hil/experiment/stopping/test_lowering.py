@@ -291,9 +291,10 @@ def test_a_turned_motor_does_not_brake_but_is_cut(ready: Any, joint: int, at: fl
     text, record, last = driven(ready, (Attack(Kind.WEAK, at, 1e9, ids[joint], 1.0, -1.0),))
     assert "lowered, so it fell" in text and "peak_torque" not in text
     assert "turns the wrong way" in text
-    assert last < at + 0.15
+    # Wherever in a cycle of 10 ms it begins: 56 to 89 ms, and 1.7 to 3.6 rad/s.
+    assert last < at + 0.1
     after = record["time"][:, 0] > at
-    assert np.abs(np.gradient(record["position"][after & (record["time"][:, 0] < last), joint], 1e-3)).max() < 3.0
+    assert np.abs(np.gradient(record["position"][after & (record["time"][:, 0] < last), joint], 1e-3)).max() < 4.0
     assert np.abs(record["current"][after, joint]).max() < 0.7 * ready.config.joints[joint].goal_limit
 
 
