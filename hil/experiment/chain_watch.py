@@ -37,7 +37,7 @@ friction of up to twice the mean from raising an alarm.
 """
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
-_IMPACT_S, _MOST_REBOUND = 0.05, 0.3
+_IMPACT_S, _MOST_REBOUND = 0.05, 0.5
 """How long a joint that has come back to its rest angle may bounce off a stop [s], and its largest speed then, relative
 to the speed before.
 """
@@ -125,9 +125,10 @@ class ChainWatch:
         towards = np.where(may_lie, self._falls_to, self._was_below * 1.0 - self._was_above * 1.0)
         approach, before = velocity * towards, self._velocity * towards
         hits = ~is_away & (before > _STILL_RAD_S) & (approach < before)  # a stop can only slow a joint down
+        is_recent = self._seen_at - self._hit_at <= _IMPACT_S
+        self._hit_speed = np.where(hits, np.maximum(before, is_recent * self._hit_speed), self._hit_speed)
         self._hit_at = np.where(hits, self._seen_at, self._hit_at)
-        self._hit_speed = np.where(hits, before, self._hit_speed)
-        bounces = (self._seen_at - self._hit_at <= _IMPACT_S) & (-approach <= _MOST_REBOUND * self._hit_speed)
+        bounces = (hits | is_recent) & (-approach <= _MOST_REBOUND * self._hit_speed)
         self._velocity = velocity
         is_home = ~is_away & ((np.abs(velocity) <= _STILL_RAD_S) | bounces)
         return np.asarray(is_home * towards)

@@ -18,6 +18,7 @@ from hil.estimator.chain.model.dynamics import TERMS
 from hil.estimator.chain.model.prior import spread_of
 from hil.estimator.chain.simulation.rollout import ChainArms, inertias, is_physical
 from hil.experiment.chain_watch import linear_parameters
+from hil.pilot.belief import MOVED_STEPS
 from hil.pilot.chain_gains import ChainGains
 from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
 from hil.runs.recording import Phase
@@ -31,6 +32,8 @@ _NOISE_TIMES = 2.0  # residuals are not white
 _LEAST_NOISE_SHARE = 0.005  # smallest noise, relative to a joint's largest torque
 _MODEL_SPREAD = 0.01  # of each parameter of links and drives, for effects that the model does not include
 _FEWEST_ROWS = 50
+_PEAK, _BREAKAWAY = 0.99, 1.15
+"""Dry friction of a joint that did not move is assumed to exceed this quantile of its torque by this factor."""
 _LEAST_FRICTION_SHARE = 1e-4
 _POSES = 12
 _HALVINGS = 6
@@ -125,6 +128,8 @@ class ChainBelief:
         moved[:, :count] += _MODEL_SPREAD * random.standard_normal((len(moved), everything.shape[1])) @ everything.T
         friction = _MODEL_SPREAD * np.abs(fitted[count:])
         moved[:, count:] += friction * random.standard_normal((len(moved), friction.size))
+        dry = moved[:, count + len(torque) : count + 2 * len(torque)]
+        np.maximum(dry, _BREAKAWAY * _withstood(config, samples, Y, torque, fitted), out=dry)
         return replace(self, arms=self._arms(moved))
 
     @property
@@ -218,6 +223,21 @@ def _rows(arms: ChainArms, config: Config, samples: NDArray[np.void]) -> tuple[A
         Y[joint, :, at + n] = np.tanh(v[joint] / _WIDTH)
         Y[joint, :, at + 2 * n] = 1.0
     return Y, torque[some].T
+
+
+def _withstood(config: Config, samples: NDArray[np.void], Y: Array, torque: Array, fitted: Array) -> Array:
+    """Torque that did not move each joint that stood still in the last period (joints,) [N m]; 0 for the others.
+
+    Y, torque: as returned by `_rows`. fitted: parameters of the arm.
+    """
+    step = np.array([joint.joint.servo.position_unit for joint in config.joints])
+    periodic = samples[samples["phase"] == Phase.PERIODIC]
+    if not len(periodic):
+        return np.zeros(len(step))
+    last = periodic["period"] == periodic["period"][-1]
+    stood = np.ptp(_filled(periodic["position"][last]), axis=0) <= MOVED_STEPS * step
+    withstood: Array = np.quantile(np.abs(torque - Y @ fitted), _PEAK, axis=1)
+    return np.where(stood, withstood, 0.0)
 
 
 def _filled(position: Array) -> Array:

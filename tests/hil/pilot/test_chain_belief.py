@@ -52,7 +52,7 @@ def recorded(config: Config, belief: ChainBelief, arm: int, share: float) -> np.
     loop = loop_of(held, segment, config.experiment.rate)  # type: ignore[arg-type]
     motion = roll_out(belief.arms.chosen([arm]), loop, np.array(config.arm.rest_pose))
     n = len(config.joints)
-    of = [("phase", int), ("segment", int), ("position", float, (n,)), ("goal_current", float, (n,))]
+    of = [("phase", int), ("segment", int), ("period", int), ("position", float, (n,)), ("goal_current", float, (n,))]
     samples = np.zeros(len(loop.goal), dtype=of)
     samples["phase"] = Phase.PERIODIC
     samples["position"] = np.round(motion.position[0] * 4096 / (2 * np.pi)) * 2 * np.pi / 4096
@@ -67,6 +67,24 @@ def test_the_weight_in_any_pose_becomes_better_known(config: Config, prior: Chai
         true = weights(prior.arms.chosen([3]), pose)[0] / prior.arms.drive[3, 4]
         assert np.all(after.std(axis=0) < before.std(axis=0))
         assert np.all(np.abs(after.mean(axis=0) - true) < before.std(axis=0) + 0.02)
+
+
+@pytest.mark.parametrize("stuck", [True, False])
+def test_the_friction_of_a_joint_that_a_torque_did_not_move_is_larger_than_that_torque(
+    config: Config, prior: ChainBelief, stuck: bool
+) -> None:
+    """The regression learns no friction from a joint at standstill, so it would be given the same torque again."""
+    samples = recorded(config, prior, 3, 0.3)
+    torque = 0.3 * np.sin(np.arange(len(samples)) / 7.0)
+    samples["goal_current"][:, 2] += torque / config.joints[2].torque_per_goal
+    if stuck:
+        samples["position"][:, 2] = config.arm.rest_pose[2]
+    samples["period"][len(samples) // 2 :] = 1
+    learned = prior.learn(config, samples)
+    before, after = (belief.torque.coulomb for belief in (prior, learned))
+    assert before[2] < 0.3
+    assert (after[2] > 0.3) == stuck
+    assert after[0] < 2.0 * before[0]
 
 
 def test_no_joint_becomes_lighter_than_an_arm_can_be(config: Config, prior: ChainBelief) -> None:
