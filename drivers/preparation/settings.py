@@ -39,9 +39,9 @@ Other writable EEPROM registers are not restored:
 - Moving Threshold, External Port Mode: they affect neither the motion nor the replies that this program uses.
 """
 
-EEPROM = ("Operating Mode", "Current Limit", *PROTECTIVE)
-"""EEPROM registers to restore, in this order: Operating Mode comes first because changing it resets RAM, and because a
-goal in current mode is torque.
+EEPROM = ("Current Limit", "Operating Mode", *PROTECTIVE)
+"""EEPROM registers to restore, in this order: a change of Operating Mode sets Goal Current to Current Limit, which is
+what most servos held before, so that no goal has to be written.
 """
 
 # Not restored: LED, which only shines; Torque Enable, which is cut; Goal Position (see above).
