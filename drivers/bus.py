@@ -21,7 +21,7 @@ from hil.drivers.preparation.prepare import (
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.read_back_exchange import ReadBackExchange
 from hil.drivers.servo import Servo
-from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
+from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, with_article
 from hil.drivers.state import NAN, SETTINGS, Converter, State, fold, read_back_spans, spans
 from hil.drivers.sync_read import Answer, Span, SyncRead
 from hil.drivers.torque.held import let_sink, refuse_held
@@ -258,10 +258,7 @@ class ServoBus(TorqueSwitch):
         return ReadBackExchange(
             self.port,
             [servo.id for servo in servos],
-            [
-                table["Goal Current" if mode is Mode.CURRENT else "Goal PWM"]
-                for table, mode in zip(tables, modes, strict=True)
-            ],
+            [table[mode.goal_register] for table, mode in zip(tables, modes, strict=True)],
             spans(modes, tables),
             return_delay,
             fast=fast,

@@ -71,6 +71,11 @@ class Mode(IntEnum):
     def goal_unit(self) -> str:
         return "A" if self is Mode.CURRENT else "V"
 
+    @property
+    def goal_register(self) -> str:
+        """Name of the register that holds the goal."""
+        return "Goal Current" if self is Mode.CURRENT else "Goal PWM"
+
 
 class Stall(NamedTuple):
     """One row of the e-Manual's stall figures: voltage [V], current [A], torque at the output shaft [N m]."""

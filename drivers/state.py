@@ -124,8 +124,7 @@ def status_span(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable], *, 
 
 
 def _status_names(mode: Mode) -> tuple[str, ...]:
-    goal = "Goal Current" if mode is Mode.CURRENT else "Goal PWM"
-    return "Bus Watchdog", goal, "Realtime Tick", _DRIVE[mode], "Present Velocity", "Present Position"
+    return "Bus Watchdog", mode.goal_register, "Realtime Tick", _DRIVE[mode], "Present Velocity", "Present Position"
 
 
 SETTINGS = ("Drive Mode", "Operating Mode", "Homing Offset")

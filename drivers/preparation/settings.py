@@ -140,7 +140,7 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
         failures |= dict.fromkeys(_differing(servo, settings, goals), reasons[0])
     else:
         _refuse_torque(servo)
-        _clear_watchdog(servo, failures)
+        _restore(servo, {"Bus Watchdog": 0}, ("Bus Watchdog",), written, failures)  # tripped, it locks the goals
         _restore(servo, settings, goals, written, failures)
     if failures:
         failed = next(iter(failures.values()))
@@ -179,15 +179,6 @@ def _doubted(servo: Servo, failures: Mapping[str, DriverError]) -> TorqueDoubted
         f"{servo.title}: its Torque Enable reads 0, but it refuses to change {' and '.join(failures)}, as servos do "
         "only with torque on."
     )
-
-
-def _clear_watchdog(servo: Servo, failures: dict[str, DriverError]) -> None:
-    """Switch the Bus Watchdog off: goals are read-only while it is tripped."""
-    try:
-        if servo.read_despite_error("Bus Watchdog") != 0:
-            servo.write_despite_error("Bus Watchdog", 0)
-    except DriverError as error:
-        failures["Bus Watchdog"] = error
 
 
 def _restore(

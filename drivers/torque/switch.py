@@ -9,7 +9,7 @@ from hil.drivers.packet import HardwareError
 from hil.drivers.port import GROWTH, Port
 from hil.drivers.preparation.prepare import fault_text, shuts_down
 from hil.drivers.servo import Servo, describe_error
-from hil.drivers.servo_model import WATCHDOG_UNIT, Mode
+from hil.drivers.servo_model import WATCHDOG_UNIT
 from hil.drivers.torque.held import switched_on
 from hil.drivers.torque.off import (
     TorqueOff,
@@ -123,7 +123,7 @@ class TorqueSwitch:
             if watched:
                 servo.write("Bus Watchdog", 0)
             # A change of Operating Mode leaves Goal Current at Current Limit, so it is zeroed before torque is on.
-            servo.write(_goal(joint), 0)
+            servo.write(joint.mode.goal_register, 0)
             if watched:
                 servo.write("Bus Watchdog", ticks)
                 self._armed.add(joint)
@@ -196,21 +196,21 @@ class TorqueSwitch:
         if interrupts:
             raise interrupts[0]
 
+    def zero_own_goals(self, on: Collection[Joint]) -> None:
+        """Set the goals of servos that are still in this program's mode to 0, or they would follow its last ones."""
+        for drive in on:
+            with suppress(DriverError):
+                servo = self._servos[drive]
+                if servo.read_despite_error("Operating Mode") == drive.mode:
+                    servo.write_despite_error(drive.mode.goal_register, 0)
+
     def report_doubted(self, drive: Joint, why: str) -> None:
         """Record in `torque_off_report` that a servo (a key of `drives`) does not behave as if its torque were off."""
         report = self.torque_off_report or TorqueOff(tuple(self._servos), ())
         self.torque_off_report = report.with_doubted(drive, why)
 
     def report_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> None:
-        """Record in `torque_off_report` that another program keeps torque on (`TorqueOff.with_driven`).
-
-        A servo still in this program's mode gets a goal of 0, or it would follow this program's last goal.
-        """
-        for drive in on:
-            with suppress(DriverError):
-                servo = self._servos[drive]
-                if servo.read_despite_error("Operating Mode") == drive.mode:
-                    servo.write_despite_error(_goal(drive), 0)
+        """Record in `torque_off_report` that another program keeps torque on (`TorqueOff.with_driven`)."""
         report = self.torque_off_report or TorqueOff(tuple(self._servos), ())
         self.torque_off_report = report.with_driven(on, silent)
 
@@ -242,7 +242,3 @@ class TorqueSwitch:
         with suppress(DriverError):
             cuts = not error or shuts_down(self._servos[drive], error)
         return fault_text(drive, cause, shuts_down=cuts) if alone or error else ""
-
-
-def _goal(joint: Joint) -> str:
-    return "Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM"

@@ -198,7 +198,7 @@ def _best_fit(
     before = _worst_residual(periods, best)
     if before > options.far and not model.zeros and model.joints > 1:
         with suppress(ConvergenceError):
-            again = _around(periods, model, prior, options, added, best)
+            again = _around(periods, model, linear, prior, options, added, best)
             best = again if _worst_residual(periods, again) < before else best
     return best
 
@@ -206,6 +206,7 @@ def _best_fit(
 def _around(
     periods: Sequence[SettledPeriod],
     model: ChainModel,
+    linear: ChainLinear,
     prior: Prior,
     options: ChainOptions,
     added: Sequence[Array | None],
@@ -219,7 +220,7 @@ def _around(
     value = dict(zip(wider.names, freed.value.tolist(), strict=True))
     near = replace(freed, value=np.array([value[name] for name in model.names]))
     narrow = replace(options, initial_width=options.other_initial_widths[-1])
-    fitted = fit_periods(periods, model, fit_lines(periods, model, prior, added), prior, narrow, added, near)
+    fitted = fit_periods(periods, model, linear, prior, narrow, added, near)
     return replace(fitted, iterations=fitted.iterations + stuck.iterations)
 
 

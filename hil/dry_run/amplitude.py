@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -218,10 +217,7 @@ def _reached(config: Config, prediction: Prediction, share: float) -> Array:
     """Fraction of its allowed range that each joint uses (joints,): the worst arm's, or the predicted one if that is
     larger.
     """
-    deviations = NormalDist().inv_cdf(1 - config.safety.limit_chance / (2 * GUARDED))
-    foreseen = prediction.share_at(deviations)[:GUARDED].max(axis=0)
-    counted = prediction.shares[:, :GUARDED].max(axis=(0, 1))
-    return np.asarray(np.maximum(foreseen, counted) / share)
+    return np.asarray(prediction.shares_with(config.safety.limit_chance)[:GUARDED].max(axis=0) / share)
 
 
 def _too_many(config: Config, plan: Plan, few: Ensemble, share: float, pose: Array | None, count: int) -> bool:

@@ -71,12 +71,11 @@ def unsafe(config: Config, foreseen: ChainPrediction) -> str:
         return f"too little clearance, {foreseen}"
     if (peaks.shares[:, :GUARDED] >= 1.0).any() or peaks.stop_chance > config.safety.limit_chance:
         row, joint = nearest_limit(peaks)
-        limit, reached = float(peaks.limits[row, joint]), float(peaks.quantile[row, joint])
-        if peaks.is_beyond(row, joint, reached):
+        chance = config.safety.limit_chance
+        reached, limit = peaks.exceeding(chance)[row, joint], peaks.limits[row, joint]
+        how_often = f"more often than safety.limit_chance allows ({100 * chance:g} %)"
+        if reached == peaks.quantile[row, joint]:
             how_often = "in 1 of 100 arms"
-        else:
-            reached = float(peaks.reached_with(config.safety.limit_chance)[row, joint])
-            how_often = f"more often than safety.limit_chance allows ({100 * config.safety.limit_chance:g} %)"
         name = config.joints[joint].name
         return f"joint {name!r} reaches {QUANTITIES[row]} {reached:.3g} (limit {limit:.3g}) {how_often}"
     return ""

@@ -72,24 +72,24 @@ class Prediction:
         All bounds are the same number of standard deviations above their medians, so that they change smoothly with the
         amplitude.
         """
-        return self._value_at(self._simultaneous())
+        return self._value_at(self.share_at(self._simultaneous()))
 
-    def reached_with(self, chance: float) -> Array:
-        """Peaks (quantities, joints) that are exceeded with a total probability of `chance`, or the worst arm's if
-        they are farther from rest.
+    def exceeding(self, chance: float) -> Array:
+        """Peaks that show why limits are exceeded more often than `chance` allows (quantities, joints): `quantile` if
+        that exceeds the limit, otherwise the values at `shares_with(chance)`.
         """
-        foreseen = self._value_at(NormalDist().inv_cdf(1.0 - chance / (2 * GUARDED)))
-        worst = np.take_along_axis(self.values, self.shares.argmax(axis=0)[None], axis=0)[0]
-        is_farther = np.abs(worst - self.origin) > np.abs(foreseen - self.origin)
-        return np.where(is_farther, worst, foreseen)
+        usual = self.share_at(self._simultaneous())
+        return self._value_at(np.where(usual >= 1.0, usual, self.shares_with(chance)))
 
-    def is_beyond(self, quantity: int, joint: int, value: float) -> bool:
-        """Whether a peak reaches or exceeds its limit."""
-        limit, origin = self.limits[quantity, joint], self.origin[quantity, joint]
-        return bool((value - limit) * (limit - origin) >= 0.0)
+    def shares_with(self, chance: float) -> Array:
+        """Fractions of the limits (quantities, joints) that are exceeded with a total probability of `chance`, or the
+        worst arm's if they are larger.
+        """
+        foreseen = self.share_at(NormalDist().inv_cdf(1 - chance / (2 * GUARDED)))
+        return np.asarray(np.maximum(foreseen, self.shares.max(axis=0)))
 
-    def _value_at(self, deviations: float) -> Array:
-        return np.asarray(self.origin + self.share_at(deviations) * (self.limits - self.origin))
+    def _value_at(self, shares: Array) -> Array:
+        return np.asarray(self.origin + shares * (self.limits - self.origin))
 
     @property
     def stop_chance(self) -> float:

@@ -303,9 +303,7 @@ def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
     """
     row, at = nearest_limit(peaks)
     joint, limit, rate = config.joints[at], float(peaks.limits[row, at]), config.experiment.rate
-    typical, reached = float(peaks.median[row, at]), float(peaks.quantile[row, at])
-    if not peaks.is_beyond(row, at, reached):
-        reached = float(peaks.reached_with(config.safety.limit_chance)[row, at])
+    typical, reached = float(peaks.median[row, at]), float(peaks.exceeding(config.safety.limit_chance)[row, at])
     share = (limit - typical) / (reached - typical) if reached != typical else 0.0
     has_room = LEAST_SPREAD_SHARE < share < 1.0
     helps = []

@@ -14,15 +14,13 @@ from hil.estimator.arrays import Array
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Watch
 from hil.pilot.chain_search import identify_chain_in_steps
+from hil.pilot.options import PilotOptions
 from hil.pilot.search import Search, with_torque
 from hil.pilot.steps import Played, Player
 from hil.plan.plan import ROLES
 from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
 from hil.setup.session.servo_session import Say, servo_session
-
-_BAND_RAISE = 3.0
-"""Factor by which the lower end of experiment.band is raised if friction holds a joint during a full run."""
 
 
 def identify_in_steps(
@@ -76,7 +74,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
         else:
             search.cap = _after_unsettled(search, found, played.error)
             search.config = _tolerant(search.config, options.max_settle_within)
-            if isinstance(played.error, DidNotMove) and (band := _faster(search.config, options.max_low)):
+            if isinstance(played.error, DidNotMove) and (band := _faster(search.config, options)):
                 experiment = search.config.experiment.model_copy(update={"band": band})
                 search.config = search.config.model_copy(update={"experiment": experiment})
                 say(
@@ -104,9 +102,8 @@ def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -
     return np.maximum(lowered, np.minimum(found.peak_torque, least))
 
 
-def _faster(config: Config, max_low: float) -> list[float]:
-    """The experiment's band with its lower end raised, to at most `max_low` times the upper end [Hz]; [] if it cannot
-    be raised.
+def _faster(config: Config, options: PilotOptions) -> list[float]:
+    """The experiment's band with its lower end raised, as far as `options` allow [Hz]; [] if it cannot be raised.
 
     If static friction far exceeds kinetic friction, a torque that moves the joint at low frequencies moves it too far.
     """
@@ -114,7 +111,7 @@ def _faster(config: Config, max_low: float) -> list[float]:
     if experiment.band is None:
         return []
     low, high = experiment.band
-    raised = round(min(_BAND_RAISE * low, max_low * high) * experiment.period) / experiment.period
+    raised = round(min(options.band_raise * low, options.max_low * high) * experiment.period) / experiment.period
     return [raised, high] if raised > low else []
 
 

@@ -80,6 +80,8 @@ class PilotOptions:
     """Maximum number of full runs if one exceeds a limit or does not settle."""
     max_unlike_runs: int = 3
     """Maximum number of full runs that may end because one period differed from the one before."""
+    band_raise: float = 3.0
+    """Factor by which the lower end of experiment.band is raised if friction holds a joint during a full run."""
     max_low: float = 0.35
     """Largest lower end of experiment.band that a repeated full run uses, as a fraction of its upper end."""
     max_settle_within: float = 0.1

@@ -16,7 +16,6 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
 from hil.drivers.read_back_exchange import ReadBackExchange
-from hil.drivers.servo_model import Mode
 from hil.setup.realtime import on_time
 
 CYCLES = 200
@@ -137,7 +136,7 @@ def measure_modes(bus: ServoBus) -> list[ExchangeMode]:
 
     Every tenth exchange includes the slow reads, so that their duration counts.
     """
-    goals = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
+    goals = [servo.read(drive.mode.goal_register) for drive, servo in bus.drives.items()]
     reads = (True, False) if bus.knows_fast_sync_read() else (False,)
     with on_time(bus.port.clock):  # as in an experiment
         return [_measure(bus, goals, fast=fast, one_write=one_write) for fast in reads for one_write in (True, False)]
@@ -164,11 +163,6 @@ def _configured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> ExchangeMode:
     return next(mode for mode in modes if (mode.one_write, mode.fast) == (bus.config.one_write, fast))
 
 
-def goal_register(joint: Joint) -> str:
-    """Name of the goal register that drives a joint in its mode."""
-    return "Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM"
-
-
 def goals_taken(bus: ServoBus) -> list[Joint]:
     """Return the servos (as single-servo joints) that accept goals from a Sync Write. Torque must be off. Raises
     DriverError.
@@ -176,14 +170,14 @@ def goals_taken(bus: ServoBus) -> list[Joint]:
     Each servo is sent a goal that differs from its current one. The goal is read back, then the previous one is
     restored.
     """
-    before = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
+    before = [servo.read(drive.mode.goal_register) for drive, servo in bus.drives.items()]
     other = [goal - 1 if goal > 0 else goal + 1 for goal in before]
     taken = []
     try:
         fast = bus.config.fast_sync_read and bus.knows_fast_sync_read()
         bus.make_exchange(fast=fast, one_write=bus.config.one_write).cycle(other)
         for (drive, servo), goal in zip(bus.drives.items(), other, strict=True):
-            if servo.read(goal_register(drive)) == goal:
+            if servo.read(drive.mode.goal_register) == goal:
                 taken.append(drive)
     finally:
         _give_back(bus, before)
@@ -195,8 +189,8 @@ def _give_back(bus: ServoBus, goals: Sequence[int]) -> None:
     failures: list[DriverError] = []
     for (drive, servo), goal in zip(bus.drives.items(), goals, strict=True):
         try:
-            if servo.read(goal_register(drive)) != goal:
-                servo.write(goal_register(drive), goal)
+            if servo.read(drive.mode.goal_register) != goal:
+                servo.write(drive.mode.goal_register, goal)
         except DriverError as error:
             failures.append(error)
     if failures:

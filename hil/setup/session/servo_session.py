@@ -196,6 +196,7 @@ class ServoSession:
         on = [joint for joint, is_on in self._torque.items() if is_on]
         silent = [joint for joint in self._on_again if self._torque.get(joint, True) is None]
         if on or silent:
+            self.bus.zero_own_goals(on)
             self.bus.report_driven(on, silent)
         if off := [joint for joint in self._on_again if joint not in {*on, *silent}]:
             yield (

@@ -241,7 +241,7 @@ def test_a_joint_that_friction_holds_gets_waves_of_higher_frequency(config: Conf
     assert second[0] == [3.0 * first[0][0], first[0][1]]
     assert (second[1] > first[1]).any()
     highest = config.model_copy(update={"experiment": config.experiment.model_copy(update={"band": [2.0, 5.0]})})
-    assert full._faster(highest, OPTIONS.max_low) == []
+    assert full._faster(highest, OPTIONS) == []
 
 
 def test_torque_that_hardly_exceeds_friction_is_not_lowered_and_a_joint_that_stood_gets_more(
