@@ -41,6 +41,7 @@ __all__ = [
     "SafetyStop",
     "SchedulerLost",
     "StopRequested",
+    "Unheard",
 ]
 
 
@@ -89,6 +90,13 @@ class Cause(Enum):
         others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
         others |= {Cause.MISSING, Cause.ALERT}
         return self.allows_braking or self in others
+
+
+class Unheard(Enum):
+    """Whose replies are missing."""
+
+    ONE = "one servo of several"
+    ALL = "every servo"
 
 
 class HilError(Exception):
@@ -149,13 +157,22 @@ class SafetyStop(ExperimentError):
     """The guard stopped the arm, or a dry run ruled out starting it. Example: joint 2 exceeded its position limit.
 
     overruled: a servo held goals or settings that this program had not written, so the commanded torque did not cause
-    the motion, which therefore reveals nothing about the arm.
+    the motion, which therefore reveals nothing about the arm. unheard: whose replies were missing, if nothing else was
+    heard in their place. remedy: the last sentences of the message, which may be replaced once more is known.
     """
 
-    def __init__(self, message: str, cause: Cause) -> None:
-        super().__init__(message)
+    overruled = False
+    unheard: Unheard | None = None
+
+    def __init__(self, message: str, cause: Cause, remedy: str = "") -> None:
+        super().__init__(f"{message} {remedy}".rstrip())
         self.cause = cause
-        self.overruled = False
+        self._remedy = remedy
+
+    def replace_remedy(self, remedy: str) -> None:
+        """Replace the last sentences of the message."""
+        self.args = (str(self).replace(self._remedy, remedy),)
+        self._remedy = remedy
 
 
 class StopRequested(ExperimentError):

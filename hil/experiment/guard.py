@@ -20,7 +20,7 @@ from hil.drivers.packet import ALERT, StatusError
 from hil.drivers.servo import describe_status_error
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import Slow, State, Status
-from hil.errors import Cause, SafetyStop
+from hil.errors import Cause, SafetyStop, Unheard
 from hil.experiment.checks import following, joint_checks, work
 from hil.experiment.checks.apart import Apart
 from hil.experiment.checks.current_noise import NoiseAllowance
@@ -45,9 +45,6 @@ _ERRORS_IN_A_ROW = 3
 """If this many consecutive replies of a servo contain both values and an error number, the arm is stopped: the servo
 may be rejecting its goals.
 """
-
-NONE_HEARD, LOST = "No servo was heard", "Requests or replies are lost"
-"""Beginnings of the explanations of a stop because no servo replies, and because one does not."""
 
 
 class Guard:
@@ -326,19 +323,19 @@ class Guard:
                 f"answers with an error ({describe_status_error(error)}) instead of its state; its last state was "
                 f"{too_long}. It refuses reads: power-cycle it.",
             )
-        self._stop(
-            index,
-            Cause.MISSING,
-            f"missed {self._missing[index]} replies in a row; its last reply was {too_long}. {self._silence_remedy()}",
-        )
-
-    def _silence_remedy(self) -> str:
+        what = f"missed {self._missing[index]} replies in a row; its last reply was {too_long}."
         if heard := self._heard_instead():
-            return heard
-        if len(self._missing) == 1 or not all(self._missing):
-            return f"{LOST}: check its cable and its supply."
+            self._stop(index, Cause.MISSING, f"{what} {heard}")
+        unheard = Unheard.ONE if len(self._missing) == 1 or not all(self._missing) else Unheard.ALL
+        stop = SafetyStop(f"{self._title(index)} {what}", Cause.MISSING, self._silence_remedy(unheard))
+        stop.unheard = unheard
+        raise stop
+
+    def _silence_remedy(self, unheard: Unheard) -> str:
+        if unheard is Unheard.ONE:
+            return "Requests or replies are lost: check its cable and its supply."
         # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
-        shared = f"{NONE_HEARD}; requests or replies are lost: check the adapter, the cables and the supply"
+        shared = "No servo was heard; requests or replies are lost: check the adapter, the cables and the supply"
         if self._silence.is_busy:
             return f"{shared}, and whether other programs keep this computer busy: this program was running late."
         return f"{shared}."
@@ -394,8 +391,11 @@ class Guard:
                 )
 
     def _stop(self, index: int, cause: Cause, what: str) -> NoReturn:
+        raise SafetyStop(f"{self._title(index)} {what}", cause)
+
+    def _title(self, index: int) -> str:
         name = self._names[index]
-        raise SafetyStop(f"{name[0].upper()}{name[1:]} {what}", cause)
+        return f"{name[0].upper()}{name[1:]}"
 
 
 def _joint_records(config: Config, planned: Sequence[float], left_by_a_run: bool) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Run the experiment on the bus: open, check, switch torque on, stream, and always switch torque off."""
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from math import floor
@@ -18,9 +17,9 @@ from hil.drivers.errors import DriverError, PortLost, ServoFault, TorqueNotOff, 
 from hil.drivers.servo import LATE
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
+from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested, Unheard
 from hil.estimator.chain.simulation.rollout import ChainArms
-from hil.experiment.guard import LOST, MOST_OUTSIDE_RAD, NONE_HEARD
+from hil.experiment.guard import MOST_OUTSIDE_RAD
 from hil.experiment.model_watch import UNLIKE_ANY_ARM
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
@@ -188,7 +187,7 @@ def _play(
         if isinstance(error, TorqueNotOff):
             _try_again(bus, note)
         if isinstance(cause, SafetyStop) and (who := _why_silent(bus, cause)):
-            cause.args = (str(cause).partition(NONE_HEARD)[0].partition(LOST)[0] + who,)
+            cause.replace_remedy(who)
             note(who)
         if isinstance(error, TorqueNotOff) and (instead := confirmed_later(bus, error)):
             if isinstance(instead, DriverError | HilError):
@@ -228,13 +227,13 @@ def _why_silent(bus: ServoBus, stop: SafetyStop) -> str:
     answered then: a silent servo hides those after it.
     """
     report = bus.torque_off_report
-    if stop.cause is not Cause.MISSING or report is None:
+    if stop.unheard is None or report is None:
         return ""
-    if bus.port.late_replies and not bus.port.strangers and re.search(f"{NONE_HEARD}|{LOST}", str(stop)):
+    if bus.port.late_replies and not bus.port.strangers:
         return LATE
     silent = {joint for joint, _ in report.unconfirmed} | report.later | report.rebooted
     heard = [str(joint) for joint in bus.drives if joint not in silent]
-    if NONE_HEARD not in str(stop) or not silent or not heard:
+    if stop.unheard is not Unheard.ALL or not silent or not heard:
         return ""
     return (
         f"No servo was heard at the stop, but {' and '.join(heard)} answered afterwards and "
