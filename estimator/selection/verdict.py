@@ -83,6 +83,8 @@ class Evidence:
     """The setting that limited the torque, for advice; "" if the user chose peak_torque."""
     conflicts: tuple[Conflict, ...] = field(default=())
     """Values far from those known beforehand."""
+    cause: str = ""
+    """A likely cause of any residual, known from how the motion was driven, as a sentence."""
 
 
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:
@@ -150,7 +152,7 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence,
     )
     if evidence.disturbances:
         return said
-    return " ".join((said, _suspicion(estimate, evidence), _spoilt(validation, trust)))
+    return " ".join((said, *_causes(estimate, evidence), _spoilt(validation, trust)))
 
 
 def unexplained_motion(joint: int, left: float) -> str:
@@ -158,6 +160,11 @@ def unexplained_motion(joint: int, left: float) -> str:
     if left <= MUCH_LEFT:
         return f"The motion of joint {joint + 1} is not fully explained"
     return f"Joint {joint + 1} moves in a way that the model cannot explain"
+
+
+def _causes(estimate: Estimate, evidence: Evidence) -> tuple[str, ...]:
+    found = _suspicion(estimate, evidence)
+    return (found, evidence.cause) if evidence.cause else (found,)
 
 
 def _suspicion(estimate: Estimate, evidence: Evidence) -> str:

@@ -6,6 +6,7 @@ from hil.clearance.space import Space
 from hil.config.chain import described_arm, doubted_gravity, doubted_inertias, doubted_limits
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
+from hil.config.varying_delay import varying_delay
 from hil.drivers.servo_prior import servo_prior
 from hil.next_step import command
 
@@ -17,6 +18,8 @@ def doubts(config: Config) -> Iterator[str]:
             yield said
         if said := _same_direction(config, joint):
             yield said
+    if said := varying_delay(config):
+        yield said
     if not config.is_chain:
         return
     arm = described_arm(config)

@@ -7,6 +7,7 @@ import numpy as np
 
 from hil.config.chain import described_arm, doubted_inertias
 from hil.config.schema import Config
+from hil.config.varying_delay import varying_delay
 from hil.description.arm import ArmDescription
 from hil.errors import RecordingCutShort
 from hil.estimation.drive.currents import settled_current_findings
@@ -311,7 +312,8 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
         else:
             causes = f'load-dependent friction ([model] friction = "auto" tries that), {causes}'
     if over > EXPLAINED:
-        return f"{said} the model is incomplete.{tried} Possible causes: {causes}."
+        likely = f" {delay}" if (delay := varying_delay(config)) else ""
+        return f"{said} the model is incomplete.{tried}{likely} {'Other p' if likely else 'P'}ossible causes: {causes}."
     return (
         f"{said} but part of it repeats with the motion. This increases standard errors by a factor of up to "
         f"{estimate.systematic:.1f}, and some values may be wrong by more than their standard errors. A small effect "

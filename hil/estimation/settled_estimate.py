@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.config.varying_delay import varying_delay
 from hil.errors import RecordingCutShort
 from hil.estimation.chain_estimate import estimate_chain_run
 from hil.estimation.drive.currents import settled_current_findings
@@ -102,6 +103,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
         tried_all=choice is not None,
         torque_limit=limit,
         conflicts=conflicts,
+        cause=varying_delay(config),
     )
     judged = judge(estimate, validation, evidence)
     checks = Checks(
