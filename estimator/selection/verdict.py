@@ -152,7 +152,7 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence,
     )
     if evidence.disturbances:
         return said
-    return " ".join((said, *_causes(estimate, evidence), _spoilt(validation, trust)))
+    return " ".join((said, _suspicion(estimate, evidence), _spoilt(validation, trust)))
 
 
 def unexplained_motion(joint: int, left: float) -> str:
@@ -162,25 +162,20 @@ def unexplained_motion(joint: int, left: float) -> str:
     return f"Joint {joint + 1} moves in a way that the model cannot explain"
 
 
-def _causes(estimate: Estimate, evidence: Evidence) -> tuple[str, ...]:
-    found = _suspicion(estimate, evidence)
-    return (found, evidence.cause) if evidence.cause else (found,)
-
-
 def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
     """Return the most likely cause of the residual, with the evidence."""
+    cause = f"{evidence.cause} " if evidence.cause else ""
     seen = [each for each in evidence.candidates if each.evidence > 1.0 and each.explained > NOTICEABLE]
     if seen:
         what = _in_words(seen[0].part)
         advice = "" if evidence.tried_all else ' [model] friction = "auto" tries that.'
-        return (
-            f"The residual looks most like {what}, which would explain {100.0 * seen[0].explained:.0f} % of it.{advice}"
-        )
+        explained = f"would explain {100.0 * seen[0].explained:.0f} % of it"
+        return f"{cause}The residual looks most like {what}, which {explained}.{advice}"
     if not evidence.tried_all and estimate.model.friction != "stribeck_load":
-        return 'No single term explains the residual; [model] friction = "auto" tries several together.'
+        return f'{cause}No single term explains the residual; [model] friction = "auto" tries several together.'
     return (
-        "No available term explains the residual. Possible causes: cogging or torque ripple, backlash, a loose screw, "
-        "a sagging supply or a dragging cable."
+        f"No available term explains the residual. {cause}{'Other possible' if cause else 'Possible'} causes: cogging "
+        "or torque ripple, backlash, a loose screw, a sagging supply or a dragging cable."
     )
 
 

@@ -32,11 +32,12 @@ def varying_delay(config: "Config") -> str:
     beat = min(left, rate - left)
     if not 1e-6 * rate < beat < _FASTEST * _highest(config):
         return ""
+    often = "once" if beat == 1.0 else f"{beat:g} times"
     choices = [f"{max(each for each in _CHOICES if each < rate)}"]
     choices += [f"{each}" for each in _CHOICES if each > rate][:1]
     return (
-        f"At experiment.rate = {rate:g}, the delay of the voltage goals probably varies by up to 1 ms, {beat:g} times "
-        f"a second: servos without current mode apply a goal at the next step of their control loop, about every ms. "
+        f"At experiment.rate = {rate:g}, the delay of the goals probably varies by up to 1 ms, {often} a second, "
+        f"because servos without current mode apply a goal at the next step of their control loop, about every ms. "
         f"Choose a rate that divides 1000, such as {' or '.join(choices)}."
     )
 

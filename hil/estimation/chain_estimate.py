@@ -312,8 +312,9 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
         else:
             causes = f'load-dependent friction ([model] friction = "auto" tries that), {causes}'
     if over > EXPLAINED:
-        likely = f" {delay}" if (delay := varying_delay(config)) else ""
-        return f"{said} the model is incomplete.{tried}{likely} {'Other p' if likely else 'P'}ossible causes: {causes}."
+        if likely := varying_delay(config):
+            return f"{said} the model is incomplete.{tried} {likely} Other possible causes: {causes}."
+        return f"{said} the model is incomplete.{tried} Possible causes: {causes}."
     return (
         f"{said} but part of it repeats with the motion. This increases standard errors by a factor of up to "
         f"{estimate.systematic:.1f}, and some values may be wrong by more than their standard errors. A small effect "

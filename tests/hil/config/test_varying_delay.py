@@ -29,12 +29,12 @@ def said(tmp_path: Path) -> Callable[..., str]:
 @pytest.mark.parametrize(
     ("rate", "beat", "choices"),
     [
-        (333, "1 times", "250 or 500"),
+        (333, "once a second", "250 or 500"),
         (331, "7 times", "250 or 500"),
         (167, "2 times", "125 or 200"),
         (90, "10 times", "50 or 100"),
-        (999, "1 times", "500 or 1000"),
-        (1001, "1 times", "1000"),
+        (999, "once a second", "500 or 1000"),
+        (1001, "once a second", "1000"),
     ],
 )
 def test_a_slow_beat_is_named_with_rates_that_avoid_it(
