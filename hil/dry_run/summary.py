@@ -120,7 +120,11 @@ def settling_text(config: Config, prediction: Prediction) -> str:
     """One sentence about how many of the simulated arms settled, and when."""
     settled = prediction.settled_after > 0
     if not settled.any():
-        return f"No simulated arm settled within {config.experiment.max_settling_periods} periods."
+        return (
+            f"No simulated arm settled within {config.experiment.max_settling_periods} periods: such a run records no "
+            "settled period to estimate from, even if it is safe. A longer period, higher frequencies, another torque "
+            "or experiment.max_settling_periods may help."
+        )
     seconds = config.experiment.ramp + config.experiment.period * float(
         np.quantile(prediction.settled_after[settled], 0.99)
     )

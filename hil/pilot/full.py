@@ -84,7 +84,10 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
             config = search.held
             plan = search.waves(config)
         before, found = found.peak_torque, search.amplitude(config, 1.0, plan)
-        say("Repeating with less torque." if (found.peak_torque < before).any() else "Repeating with another waveform.")
+        how = "less torque" if (found.peak_torque < before).any() else "another waveform"
+        within = search.config.experiment.settle_within
+        more = "" if played.passed_limit else f", with settle_within = {within:g} instead of the file's"
+        say(f"Repeating with {how}{more}.")
 
 
 def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -> Array:
