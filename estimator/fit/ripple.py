@@ -61,7 +61,7 @@ def _parts(each: list[tuple[Array, Array, Array, Array]]) -> list[tuple[Array, i
 def _prepared(
     period: SettledPeriod, motion: PeriodicMotion, harmonics: int, joint: int, delay: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return a joint's columns and torque on the lines as real numbers; its torque and angle over time (samples,)."""
+    """Return a joint's columns and torque on the Fourier lines as real numbers, and both torque and angle over time."""
     Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)[joint]
     velocity = motion.velocity[joint]
     sign = np.tanh(velocity / COULOMB_WIDTH)

@@ -1,4 +1,7 @@
-"""Weak prior, from a description of the arm, on base parameters and torque constants that the data do not determine."""
+"""Weak prior on base parameters and torque constants that the data do not determine.
+
+It is derived from a description of the arm.
+"""
 
 from dataclasses import dataclass
 
