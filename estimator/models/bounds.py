@@ -25,7 +25,7 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
 
     The standard errors are those for independent errors with variance 1. normal (coordinates, coordinates), gradient
     (coordinates,): normal matrix and gradient of the sum of squares. slopes: derivatives of the parameters with respect
-    to their coordinates, which are the first ones (parameters, parameters).
+    to their coordinates, which come first (parameters, parameters).
     """
     # Each coordinate by its own scale: that of a parameter that has run to zero is many orders of magnitude smaller.
     scale = np.sqrt(np.diag(normal))

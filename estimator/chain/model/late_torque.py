@@ -59,7 +59,7 @@ def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -
     This limit biases the estimated inertias. A back-EMF is named only if the inertia that it would cancel exceeds the
     standard error of a base parameter.
 
-    std: standard errors of the base parameters; those of other parameters may follow.
+    std: standard errors of the base parameters, optionally followed by those of other parameters.
     """
     generating = _generating(base.chain.joints, parameters)
     most, parts = _most_lost(base, parameters, generating)
