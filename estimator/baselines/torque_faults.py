@@ -51,8 +51,8 @@ class Clipped:
 class Stop:
     """A yielding stop or object that a joint seems to press against beyond the angle `at` [rad].
 
-    side: 1 if the joint touches it at larger angles, -1 if at smaller ones. stiffness: N m/rad. residual, residual_given:
-    relative RMS of the joint's torque residual, with the stop and without it.
+    side: 1 if the joint touches it at larger angles, -1 if at smaller ones. stiffness: N m/rad.
+    residual, residual_given: relative RMS of the joint's torque residual, with the stop and without it.
     """
 
     joint: int

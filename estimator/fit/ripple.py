@@ -29,7 +29,7 @@ STRIBECK_VELOCITY = 0.15  # rad/s: a rough value suffices to separate the Stribe
 
 
 def find_waves(periods: Sequence[SettledPeriod], linear: LinearEstimate, wave: Wave) -> dict[str, float]:
-    """Return cycles per turn and sine and cosine parts of each joint's ripple [1] or cogging [N m], by parameter."""
+    """Return each joint's cycles per turn and the sine and cosine parts of its ripple [1] or cogging [N m], by name."""
     found: dict[str, float] = {}
     for joint in range(periods[0].joints):
         each = [
