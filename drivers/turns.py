@@ -27,7 +27,7 @@ class Turns:
         """Number of cycles since the previous sample that have not yet been counted."""
 
     def count(self, left: int) -> None:
-        """Count the cycles run so far. left: number of planned cycles not yet run (-1: one more was run)."""
+        """Count the cycles run so far. left: number of planned cycles not yet run (-1 if one more was run)."""
         passed = self.usual - left
         self._until_status -= passed
         self._until_slow -= passed - self.between
@@ -55,6 +55,6 @@ class Turns:
             self._until_status = min(self._until_status, 1)
 
     def plan(self) -> int:
-        """Return the minimum number of cycles before another span is due; cycles between samples may increase it."""
+        """Return the minimum number of usual cycles before another span is due; cycles between samples may delay it."""
         self.usual = max(0, min(self._until_slow, self._until_status) - 1)
         return self.usual

@@ -1,4 +1,4 @@
-"""Torque constants from a known mass, by maximum likelihood over two settled periods, without and with the mass.
+"""Torque constants from a known mass, by maximum likelihood over two settled periods, one of them with the mass.
 
 Every parameter of a joint scales with its torque constant. A mass M bolted to the last link at a known distance changes
 the arm's parameters by amounts that are known in kilograms and metres:
@@ -113,7 +113,7 @@ def calibrate(
         ConvergenceError: if the fit does not converge.
     """
     if without.joints != with_mass.joints:
-        raise ModelError(f"one run has {without.joints} joints and the other {with_mass.joints}: they must agree")
+        raise ModelError(f"one run has {without.joints} joints but the other has {with_mass.joints}")
     problem = _TwoRuns((without, with_mass), first, known.change(gravity, without.joints), options)
     minimum = minimise(problem.evaluate, problem.start(), options.ftol, options=options.minimiser)
     x, joints = minimum.x, without.joints

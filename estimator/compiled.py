@@ -27,7 +27,7 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def inner(function: Any, **options: Any) -> Any:
-    """Compile a function to be called by compiled loops: it runs without the GIL and has no C wrapper."""
+    """Compile a function for use in compiled loops: it runs without the GIL and has no C wrapper."""
     compile_it: Any = numba.njit
     return compile_it(nogil=True, error_model="numpy", no_cfunc_wrapper=True, **options)(function)
 
@@ -43,8 +43,8 @@ def embedded(function: Any, **options: Any) -> Any:
 def only_version(dispatcher: Any) -> Any:
     """Return the machine code of a compiled function that has been called with arguments of one set of types.
 
-    Calling it skips the lookup of the argument types, 0.1 us per array. Use it only where these types never change.
-    Without a compiler (NUMBA_DISABLE_JIT) or with several versions, the function is returned unchanged.
+    Calling it skips the lookup of the argument types, which takes 0.1 us per array. Use it only where these types never
+    change. Without a compiler (NUMBA_DISABLE_JIT) or with several versions, the function is returned unchanged.
     """
     versions = list(getattr(dispatcher, "overloads", {}).values())
     return versions[0].entry_point if len(versions) == 1 else dispatcher

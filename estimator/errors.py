@@ -18,7 +18,7 @@ class EstimationError(Exception):
 
 
 class ExcitationError(EstimationError):
-    """A multisine cannot be built: an empty band, a line above half the rate, or a peak that is not positive."""
+    """A multisine cannot be built: its band is empty, a line is above half the rate, or a peak is not positive."""
 
 
 class RecordingError(EstimationError):

@@ -85,7 +85,7 @@ def identify(
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
     for period in given:
         if model.joints != period.joints:
-            raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
+            raise ModelError(f"the model has {model.joints} joints but the period has {period.joints}")
     used = [without_spikes(period) for period in given]
     linear = fit_lines(*used)
     fit = fit_runs(used, model, linear, coarse=coarse, starts=starts, near=near, options=options)

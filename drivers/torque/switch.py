@@ -28,10 +28,10 @@ WATCH_S = 0.1
 
 
 class TorqueSwitch:
-    """Servos on one port, whose torque is switched on and off together.
+    """Switches torque on and off for all servos on one port together.
 
-    servos: keyed by single-servo joints, in bus order. After any error the same object can still cut torque;
-    `torque_off_report` then shows whether that succeeded.
+    servos: the servos in bus order, keyed by single-servo joints. After any error, the same object can still cut
+    torque; `torque_off_report` then shows whether it succeeded.
     """
 
     def __init__(self, port: Port, servos: Mapping[Joint, Servo]) -> None:
@@ -71,7 +71,7 @@ class TorqueSwitch:
                 raise TorqueNotOff(str(report))
 
     def wait_switched_off(self, until: float) -> None:
-        """Wait until `until` [s, on the port's clock] and call `refuse_switched_on` at least every WATCH_S."""
+        """Wait until the time `until` [s, on the port's clock], calling `refuse_switched_on` at least every WATCH_S."""
         clock = self.port.clock
         self.refuse_switched_on()
         while (now := clock.now()) < until:
@@ -159,7 +159,7 @@ class TorqueSwitch:
         return self.torque_off_report
 
     def shorten_watchdogs(self, seconds: float) -> None:
-        """Until torque is off, reduce the timeouts of the armed Bus Watchdogs to `seconds` [s] where they are longer.
+        """Shorten the timeouts of the armed Bus Watchdogs to `seconds` [s] until torque is off; keep shorter timeouts.
 
         Nothing is read back: a servo that misses the packet keeps its previous timeout.
         """
@@ -179,13 +179,13 @@ class TorqueSwitch:
             tell_torque_off(self.port, self._servos)
 
     def torque_now(self) -> dict[Joint, bool | None]:
-        """Read, for each servo not reported as unconfirmed, whether its torque is on; None if unknown."""
+        """Read whether the torque of each servo is on; None if unknown. Omits servos reported as unconfirmed."""
         report = self.torque_off_report
         unconfirmed = set() if report is None else {joint for joint, _ in report.unconfirmed}
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
 
     def has_torque(self) -> bool:
-        """Read, outside the control cycle, whether torque is on at all servos; False if one does not answer."""
+        """Read outside the control cycle whether torque is on at all servos; False if a servo does not answer."""
         return all(is_torque_on(servo) for servo in self._servos.values())
 
     def cut_foreign_torque(self, on: Collection[Joint]) -> None:
@@ -197,7 +197,7 @@ class TorqueSwitch:
             raise interrupts[0]
 
     def zero_own_goals(self, on: Collection[Joint]) -> None:
-        """Set the goals of servos that are still in this program's mode to 0, or they would follow its last ones."""
+        """Zero the goals of servos still in this program's mode; otherwise, they would follow its last goals."""
         for drive in on:
             with suppress(DriverError):
                 servo = self._servos[drive]
@@ -231,7 +231,7 @@ class TorqueSwitch:
     def _fault(self, drive: Joint, *, alone: bool = True) -> str:
         """Return the fault of one servo as text, or "" if it reports none and another servo may have raised the alert.
 
-        alone: whether it is the joint's only servo, in which case the alert is certainly its own.
+        alone: whether this is the joint's only servo, so that the alert is certainly its own.
         """
         try:
             error = self._servos[drive].hardware_error()

@@ -138,7 +138,7 @@ def fit_inverse_dynamics(
     coulomb_width: width of the smoothed Coulomb step [rad/s].
     delay: delay of the torque [s].
     position_cutoff: cut-off frequency for the positions from which regressors are computed [Hz]; by default `cutoff`.
-    more: further columns of the regressor; their coefficients follow the base parameters, without names.
+    more: further columns of the regressor; their coefficients follow the base parameters and have no names.
     Raises RecordingError, UnidentifiableError.
     """
     rows = [filtered_rows(recording, cutoff, coulomb_width, delay, position_cutoff, more) for recording in recordings]
@@ -160,7 +160,7 @@ def _solve(Y: Array, tau: Array, weight: Array) -> tuple[Array, Array]:
     U, size, Vt = linalg.svd(A / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
     if size[-1] * WORST_CONDITION < size[0] or np.any(norm == 0.0):
         raise UnidentifiableError(
-            "filtered inverse dynamics: the motion does not separate the parameters; move both joints, faster and "
+            "filtered inverse dynamics: the motion does not separate the parameters; move both joints faster and "
             "farther"
         )
     theta = Vt.T @ ((U.T @ b) / size)

@@ -102,7 +102,7 @@ def _scales(names: tuple[str, ...], start: Array) -> Array:
 def _accelerations(p: Any, width: float, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> Any:
     """Return the accelerations for the twelve constants `p`.
 
-    The determinant is bounded below to keep them finite if a filter's parameters leave the physical range.
+    A lower bound on the determinant keeps them finite if a filter's parameters leave the physical range.
     """
     across = p[1] * np.cos(q2)
     turning = p[1] * np.sin(q2)

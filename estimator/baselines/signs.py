@@ -3,7 +3,8 @@
 Angles that are measured from a fixed direction instead of from the previous link are detected in the same way.
 
 If the torque of the only joint, or of all joints, is reversed, the residual stays the same but inertias and friction
-become negative. Reversing only one of two joints contradicts the other's equations and so increases the residual.
+become negative. If only one of two torques is reversed, it contradicts the other joint's equations, and the residual
+increases.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,8 +24,8 @@ LESS_RESIDUAL = 0.6
 """A combination is credible if its residual is below this fraction of the residual with the signs as given."""
 
 SAME_RESIDUAL = 1.05
-"""A combination that also makes a negative inertia or friction positive is credible if its residual is up to this
-multiple of the residual with the signs as given, and explains most of the torque (MOST_LEFT).
+"""A combination that also makes a negative inertia or friction positive is credible if its residual is at most
+this multiple of the residual with the signs as given, and explains most of the torque (MOST_LEFT).
 """
 
 MOST_LEFT = 0.5
@@ -130,10 +131,10 @@ class Absolute:
 
 
 def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = ()) -> Absolute | None:
-    """Return evidence that joint 2's angle is absolute; None if that does not explain the recordings much better.
+    """Return evidence that joint 2's angle is absolute; None if this would not explain the recordings much better.
 
     turned: angles [rad] to try adding to the difference, in case the two angles were measured from different
-    directions; quarter turns are always tried. The first that explains the recordings as well as any other is chosen.
+    directions; quarter turns are always tried. If several fit equally well, the first is chosen.
     """
     if recordings[0].joints != 2:
         return None
@@ -147,7 +148,10 @@ def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = 
 
 
 def suspect_absolute_unzeroed(recordings: Sequence[Recording]) -> Absolute | None:
-    """Like `suspect_absolute`, but for recordings with unknown zeros, which gravity determines after the change."""
+    """Like `suspect_absolute`, but for recordings with unknown zeros.
+
+    The zeros are estimated from gravity after the difference between the angles has been taken.
+    """
     if recordings[0].joints != 2:
         return None
     apart = [_difference(each, 0.0) for each in recordings]

@@ -1,5 +1,5 @@
-"""Detection of motor torques that differ from the torque column: clipped by the drive, timestamped by a different
-clock, or delayed on one joint; and of stops that add a torque of their own.
+"""Detection of motor torques that differ from the torque column (clipped by the drive, timestamped by a different
+clock, or delayed on one joint), and of stops that exert an additional torque.
 
 As in the detection of reversed columns (`hil.estimator.baselines.signs`), the residual of inverse dynamics for the
 torque as given is compared with that for a modified torque.
@@ -51,8 +51,8 @@ class Clipped:
 class Stop:
     """A yielding stop or object that a joint seems to press against beyond the angle `at` [rad].
 
-    side: 1 if it is touched at larger angles, -1 at smaller ones. stiffness: N m/rad. residual, residual_given:
-    relative RMS of the joint's torque residual, with the stop and without it.
+    side: 1 if the joint touches it at larger angles, -1 if at smaller ones. stiffness: N m/rad.
+    residual, residual_given: relative RMS of the joint's torque residual, with the stop and without it.
     """
 
     joint: int
@@ -95,10 +95,10 @@ class Late:
 
 @dataclass(frozen=True)
 class Uneven:
-    """Joints whose own torques fit their motion best with different delays.
+    """Two joints whose torques fit their own motion best with different delays.
 
-    late, early: the joints (from 1) with the longest and the shortest delay. by: difference of the delays [s].
-    residual, residual_given: relative RMS of the torque residual of one of them, with its own and the other's delay.
+    late, early: the joints (from 1) with the longest and the shortest delay. by: difference between these delays [s].
+    residual, residual_given: relative RMS of one joint's torque residual, with its own delay and with the other's.
     """
 
     late: int
@@ -109,7 +109,7 @@ class Uneven:
 
 
 def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
-    """Return the joints whose motion a limited torque explains much better than the torque as given."""
+    """Return the joints whose motion is explained much better by a limited torque than by the torque as given."""
     given = _residuals(recordings)
     if given is None:
         return ()
@@ -132,7 +132,7 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
 
 
 def suspect_stop(recordings: Sequence[Recording]) -> Stop | None:
-    """Return the stop that explains the motion much better than the torque alone and than springs, or None."""
+    """Return the stop that explains the motion much better than the torque alone or springs; None if there is none."""
     joints = recordings[0].joints
     given, sprung = _residuals(recordings), _residuals(recordings, _springs)
     if given is None or sprung is None:
@@ -189,7 +189,7 @@ def suspect_late(recordings: Sequence[Recording]) -> Late | None:
 
 
 def suspect_uneven(recordings: Sequence[Recording]) -> Uneven | None:
-    """Return the joints whose best delays differ, each evaluated by its own residual."""
+    """Return two joints whose best delays, each judged by the joint's own residual, differ; None if there are none."""
     joints = recordings[0].joints
     if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
         return None

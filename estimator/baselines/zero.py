@@ -16,8 +16,8 @@ CUTOFF, WIDTH = 8.0, 0.05  # Hz, rad/s
 EXPLAINED = 0.5  # maximum ratio of the torque's residual with free zero angles to that with the given ones
 LEAST = 0.3  # rad: smaller zero errors are left to the fit
 QUARTER, TIE = 0.5 * np.pi, 1.05
-"""Quarter turns [rad] are preferred if they leave a residual of up to TIE times the smallest: a weak or slow motion
-determines the zero of joint 2 poorly.
+"""Zeros that are multiples of QUARTER [rad] are preferred if their residual is less than TIE times the smallest, since
+a weak or slow motion determines the zero of joint 2 poorly.
 """
 SURE = 0.05  # fraction of the largest torque: weaker gravity does not reveal an angle
 

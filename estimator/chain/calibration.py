@@ -1,4 +1,4 @@
-"""Torque constants of a spatial arm from a known mass: one fit to two settled periods, without and with the mass.
+"""Torque constants of a spatial arm from a known mass: one fit to a settled period without the mass and one with it.
 
 A known mass on a link changes the base parameters by amounts known in kilograms and metres. In units of the first
 joint's assumed torque constant, this change appears multiplied by the ratio of assumed to true constant, which is a

@@ -44,9 +44,11 @@ TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 
 
 @dataclass(frozen=True)
 class Reversed:
-    """Reversed columns. residuals: relative RMS of the worst joint's torque residual with the change and without it.
-    impossible: whether friction is negative with the columns as given, as when all torques, or the columns of a
-    vertical first joint, are reversed.
+    """Reversed columns.
+
+    residuals: relative RMS of the worst joint's torque residual with the change and without it.
+    impossible: whether friction is negative with the columns as given. This happens if all torques are reversed, or
+    the columns of a vertical first joint.
     """
 
     residuals: tuple[float, float]
@@ -96,7 +98,7 @@ class _Solved:
         return float(self.relative.max())
 
     def distance(self, prior: Prior) -> float:
-        """Squared distance of the base parameters from the description's, in the prior's standard deviations."""
+        """Squared distance of the base parameters from those of the description, in the prior's standard deviations."""
         return float(np.sum(np.square((self.value[: prior.value.size] - prior.value) / prior.std)))
 
     @property
@@ -117,7 +119,7 @@ class ColumnCheck:
 
     @classmethod
     def of(cls, recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> "ColumnCheck | None":
-        """Filter as the regression does; None if the recordings are too short for that."""
+        """Return a check of the recordings, filtered as in the regression; None if they are too short for that."""
         for cutoff in CUTOFFS:
             with suppress(RecordingError):
                 check = cls(recordings, model, prior, cutoff, LAG)
@@ -216,7 +218,7 @@ class ColumnCheck:
         return Late(residuals, chosen, late) if is_late and residuals[0] < LATE * residuals[1] else None
 
     def contradictory_torques(self) -> tuple[float, ...] | None:
-        """Return torque factors relative to joint 1's (joints,) that explain the recordings better than equal factors.
+        """Return torque factors relative to joint 1's (joints,) if they explain the recordings better than equal ones.
 
         The links' prior is weak and friction absorbs much of an error, so even a small improvement is evidence.
         """
@@ -248,7 +250,7 @@ class ColumnCheck:
         return WrongTimes((worst, given.worst), factor) if worst < min(CLEAR * given.worst, WELL) else None
 
     def _slower(self, factor: float) -> float:
-        """The residual on the assumption that the true times are those of the recordings divided by `factor`."""
+        """The worst joint's residual with the recorded times divided by `factor`."""
         try:
             changed = [replace(each, time=each.time / factor) for each in self.recordings]
             return replace(self, recordings=changed, cutoff=self.cutoff * factor)._given[1].worst
@@ -256,7 +258,10 @@ class ColumnCheck:
             return np.inf
 
     def _dissipates_too_little(self, found: _Solved) -> bool:
-        """Whether more friction terms are significantly negative than positive, or all of one joint's are negative."""
+        """Whether too many friction terms are significantly negative.
+
+        That is, more than are significantly positive, or all those of one joint.
+        """
         start, joints = self.model.base.count, self.model.joints
         over = (found.value / found.std)[start : start + 2 * joints].reshape(2, joints)
         negative = over < -SIGNIFICANT
@@ -284,7 +289,7 @@ class _Normal:
         return cls(squares, *_driven(columns, torque), rows)
 
     def driven_by(self, columns: Array, torque: Array) -> "_Normal":
-        """Return the equations for other torques; `columns` as for `of`."""
+        """Return the equations for other torques; `columns` is the same regressor as in `of`."""
         return _Normal(self.squares, *_driven(columns, torque), self.rows)
 
     def solved(self, factors: Array, prior: Prior) -> _Solved:

@@ -164,7 +164,7 @@ def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int
 def largest_ratio(one: Array, other: Array) -> float:
     """Return the largest element-by-element ratio of two vectors of standard errors; infinite if no pair is finite.
 
-    The largest counts because an unmodelled effect may act on only one joint.
+    The maximum is used because an unmodelled effect may act on only one joint.
     """
     known = np.isfinite(one) & np.isfinite(other)
     return float(np.max(one[known] / other[known])) if known.any() else np.inf
@@ -212,8 +212,9 @@ def _around(
     added: Sequence[Array | None],
     stuck: ChainFit,
 ) -> ChainFit:
-    """Fit with free encoder zeros first, whose further directions may lead out of the valley in which `stuck` ended;
-    then fit `model` from there.
+    """Fit with free encoder zeros, then fit `model` from there.
+
+    The additional freedom may lead out of the valley in which `stuck` ended.
     """
     wider = replace(model, zeros=True)
     freed = fit_periods(periods, wider, fit_lines(periods, wider, prior, added), prior, options, added)

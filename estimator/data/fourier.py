@@ -84,7 +84,7 @@ def _upper_noise(position: Array) -> Array:
 
 
 def _interpolated_noise(valid: Mask) -> float:
-    """Return the noise estimated from unit white noise that is interpolated except at `valid` (samples,)."""
+    """Return the noise estimate for unit white noise whose samples are interpolated except at `valid` (samples,)."""
     if valid.all() or not valid.any():
         return 1.0
     return float(np.sqrt(np.mean(np.square(_upper_noise(interpolated_noise(valid))))))

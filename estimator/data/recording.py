@@ -196,7 +196,7 @@ def _check_values(recording: Recording) -> None:
         most = float(np.abs(torque).max())
         if most > MOST_TORQUE:
             raise RecordingError(
-                f"joint {joint + 1}: torque reaches {most:.3g} N m, more than {MOST_TORQUE:g}: check its unit"
+                f"joint {joint + 1}: torque reaches {most:.3g} N m, which exceeds {MOST_TORQUE:g} N m: check its unit"
             )
 
 
@@ -226,8 +226,8 @@ def _check_motion(recording: Recording) -> None:
             )
         if swing > MOST_ANGLE:
             raise RecordingError(
-                f"joint {joint + 1} moves through {swing:.4g} rad, more than {MOST_ANGLE:g}: are these degrees or "
-                "encoder steps? Set the column's unit"
+                f"joint {joint + 1} moves through {swing:.4g} rad, which exceeds {MOST_ANGLE:g} rad: are these degrees "
+                "or encoder steps? Set the column's unit"
             )
         if speed[k] > MOST_SPEED:
             raise RecordingError(

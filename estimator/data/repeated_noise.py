@@ -52,7 +52,7 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
     Args:
         passes: angles (joints, samples) [rad] of successive passes of the same motion; NaN where a sample is missing.
         step: encoder step of each joint (joints,) [rad].
-        averaged: number of passes whose mean is the sample.
+        averaged: number of passes averaged to obtain the sample.
 
     Returns:
         The standard deviations; None for fewer than two passes, or if they are too short.
@@ -73,9 +73,9 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
 def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> Array | None:
     """Return the standard deviation of the noise of one averaged sample in excess of white noise (joints,) [rad].
 
-    It is 0 unless significant. On the lines on which the motion may have changed from pass to pass, the noise is
-    extrapolated: between these lines and the octave above, it is assumed to change by the same factor as between that
-    octave and the next. Noise with a long correlation is underestimated. Takes the arguments of `repeated_noise`, and
+    It is 0 unless significant. At low frequencies, where the motion may have changed from pass to pass, the noise is
+    extrapolated: its ratio to the noise in the octave above is assumed to equal the ratio between that octave and the
+    next. Noise with a long correlation is underestimated. Takes the arguments of `repeated_noise`, and
     returns None in the same cases.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
@@ -90,8 +90,9 @@ def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
 
 
 def _excess(former: Array, later: Array) -> tuple[float, float]:
-    """Return the power of the difference of two passes (samples,) in excess of white noise, and that of the white
-    noise.
+    """Return the excess power and the white-noise power in the difference of two passes (samples,).
+
+    The excess is the power beyond that of white noise.
     """
     difference = later - former
     valid = np.isfinite(difference)
@@ -166,8 +167,8 @@ def _power(difference: Array) -> Array:
 def _not_drifted(difference: Array, differs: Array) -> Array:
     """Return the fraction (joints, orders) of each order of the rounding error that repeats despite drift.
 
-    difference: difference of two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,). A fraction of
-    `differs` is noise in the estimated drift; its effect is divided out.
+    difference: difference of two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,). The
+    estimated drift contains noise, a fraction of `differs`; its effect is divided out.
     """
     filled = _filled(difference)
     closed = without_jump(filled)

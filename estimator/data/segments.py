@@ -130,8 +130,10 @@ def _lagging(torque: Array, step: float, lag: float) -> Array:
 
 
 def grid_torque_slopes(recording: Recording, grid: Grid, delays: Array, lags: Array) -> Array:
-    """Differentiate `grid_torque` with respect to each joint's delay and lag (2, joints, steps) [N m/s], by central
-    differences. Without a lag, the two derivatives are equal, as for a tiny lag.
+    """Differentiate `grid_torque` with respect to each joint's delay and lag (2, joints, steps) [N m/s].
+
+    Central differences are used. If any joint has no lag, the derivatives with respect to lag are taken to equal those
+    with respect to delay, as they do for a tiny lag.
     """
 
     def by(delay: Array | float, lag: Array | float) -> Array:

@@ -114,8 +114,8 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
     Two distances are computed for each reading: from the median of itself and two neighbours on either side, and from a
     cubic through its neighbours. The reading is an outlier if both exceed SPIKE encoder steps and SPIKE times the
     typical distance from the median. At a low sampling rate, the median alone would mistake every fast reversal for an
-    outlier. If more than the fraction MOST_SPIKES would be marked, none is: the joint moves fast compared with the
-    sample rate.
+    outlier. If more than the fraction MOST_SPIKES would be marked, none are, since the joint must be moving fast
+    for this sample rate.
     """
     from scipy.ndimage import median_filter
 
@@ -190,8 +190,8 @@ def _check_motion(period: SettledPeriod) -> None:
         least = LEAST_MOTION * float(period.position_step[joint])
         if swing <= least:
             raise StandstillError(
-                f"joint {joint + 1}, held by friction, moved by {swing:.2g} rad; at least {least:.2g} rad are needed: "
-                "raise its peak torque"
+                f"joint {joint + 1} was held by friction and moved by only {swing:.2g} rad; at least {least:.2g} rad "
+                "are needed: raise its peak torque"
             )
     filled = period.filled()
     for joint, row in enumerate(filled):
@@ -200,6 +200,6 @@ def _check_motion(period: SettledPeriod) -> None:
         most = max(MOST_GAP * float(np.abs(np.diff(row)).max()), MOST_DRIFT * float(np.ptp(row)))
         if gap > most:
             raise RecordingError(
-                f"joint {joint + 1} ends the period {gap:.3g} rad from where it began, more than {most:.3g} rad: it "
-                "went over the top or has not settled; lower the peak torque or wait longer"
+                f"joint {joint + 1} ends the period {gap:.3g} rad from where it began (at most {most:.3g} rad is "
+                "allowed): it went over the top or has not settled; lower the peak torque or wait longer"
             )

@@ -36,7 +36,7 @@ class AlteredFit:
 
 
 class Altered:
-    """Segments of an estimate, with unknowns for a defect in addition to the parameters."""
+    """Fits the segments of an estimate with unknowns for a defect in addition to the parameters."""
 
     def __init__(self, recordings: Sequence[Recording], found: ShootingEstimate) -> None:
         self.estimate = estimate = _with_every_friction(found)
@@ -97,8 +97,9 @@ class Altered:
         return np.ones_like(value) if hypothesis.is_absolute else value
 
     def fit(self, hypothesis: Hypothesis | None, near: AlteredFit | None = None) -> AlteredFit:
-        """Fit parameters, zeros and defect. near: fit of another defect, a further initial guess. Raises
-        ConvergenceError.
+        """Fit parameters, zeros and defect. Raises ConvergenceError.
+
+        near: fit of another defect, used as a further initial guess.
         """
         key = None if hypothesis is None else (hypothesis.kind, hypothesis.joints, hypothesis.course)
         if key not in self._fits:
@@ -267,7 +268,10 @@ class _Posed:
 
 
 def _with_every_friction(found: ShootingEstimate) -> ShootingEstimate:
-    """Return the estimate with all dry-friction terms, so that no defect imitates one; an added load term is 0."""
+    """Return the estimate with all dry-friction terms, so that no defect is found in place of a missing term.
+
+    Load terms that the estimate lacks are set to 0, other missing terms to their usual initial guess.
+    """
     model = replace(found.model, friction=FRICTIONS[-1])
     values = {name: term_of(name).initial for name in model.names} | {
         f"load_{joint}": 0.0 for joint in range(1, model.joints + 1)

@@ -42,7 +42,7 @@ class Course:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A defect to be tested. joints: affected joints, counted from 1; empty for the whole arm."""
+    """A defect to test. joints: affected joints, counted from 1; empty for the whole arm."""
 
     kind: Kind
     joints: tuple[int, ...]
@@ -67,7 +67,7 @@ class Hypothesis:
 def hypotheses(
     recordings: Sequence[Recording], segments: Sequence[RecordingSegment], values: Mapping[str, float], gravity: bool
 ) -> list[Hypothesis]:
-    """Return all defects to be tested. values: parameters by name [SI]; gravity: whether it acts on the arm."""
+    """Return all defects to test. values: parameters by name [SI]; gravity: whether it acts on the arm."""
     joints = recordings[0].joints
     always = np.ones(len(segments))
     # Without gravity, the scale of the first joint's angle is that of its inertia and friction.
@@ -116,7 +116,10 @@ def _load(joints: int) -> tuple[Direction, ...]:
 
 
 def _torque_gain(joint: int, values: Mapping[str, float]) -> Direction:
-    """Return the effect of a torque above the recorded one; if it is joint 1's, all other values appear smaller."""
+    """Return the effect of a torque above the recorded one.
+
+    Joint 1's torque is the reference: if it was larger than recorded, all other values appear smaller.
+    """
     if joint > 1:
         return {"torque_scale_2": 1.0}
     less = [name for name in values if term_of(name).unit in TORQUE_UNITS or name == "torque_scale_2"]

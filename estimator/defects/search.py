@@ -143,7 +143,7 @@ class _Linear:
     """Normal equations of each segment near the estimate, in all linear unknowns.
 
     normal: (segments, unknowns, unknowns); gradient: (segments, unknowns); squares, samples: sum of squares, and number
-    of measured angles (segments,). fitted: unknowns that are fitted without any defect. colour: see `candidates`.
+    of measured angles (segments,). fitted: unknowns that are fitted even without a defect. colour: see `candidates`.
     """
 
     normal: Array

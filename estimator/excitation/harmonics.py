@@ -1,4 +1,4 @@
-"""Lines available to an excitation: multiples of 1 / period within a band."""
+"""Spectral lines available to an excitation: multiples of 1 / period within a band."""
 
 import math
 

@@ -51,7 +51,7 @@ class Design:
 
 
 def smoothed(physics: Physics) -> Physics:
-    """Return the arm with friction steps at least LEAST_WIDTH wide, which is faster to simulate."""
+    """Return the arm with friction steps widened to at least LEAST_WIDTH, so that it can be simulated faster."""
     vector = physics.vector.copy()
     for joint in (1, 2):
         index = CONSTANTS.index(f"coulomb_width_{joint}")
@@ -105,7 +105,7 @@ class DesignProblem:
         return np.maximum(np.abs([known[name] for name in against]), 1e-9)
 
     def shares(self, wave: Multisine) -> Array:
-        """Return the fraction of its limits that each joint uses (joints,) in the transient and the settled period."""
+        """Return each joint's use of its limits as a fraction (joints,), in the transient and the settled period."""
         response = self._two_periods(wave)
         limits, pose = self.limits, self.pose
         up = (response.position.max(axis=1) - pose) / (limits.high - pose)
@@ -182,7 +182,7 @@ class DesignProblem:
 
 @one_blas_thread
 def design_optimal(plain: Multisine, problem: DesignProblem, seed: int) -> Design:
-    """Starting from `plain`, whose lines and period are kept, reduce the standard errors that `problem` defines.
+    """Reduce the standard errors defined by `problem`, starting from `plain` and keeping its lines and period.
 
     The same seed gives the same wave.
     """

@@ -7,8 +7,8 @@ all windows of L samples, of the outer product of the window's score with itself
 
 Model errors are not only correlated: they repeat at every reversal, so averaging does not remove them, and any part
 that resembles the effect of a parameter leaves no residual at all. Therefore the non-white part of the residual widens
-the standard errors further: 1.4 of them cover every change in the parameters that alters the motion (RMS) by no more
-than this non-white part (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
+the standard errors further: 1.4 standard errors cover every change in the parameters that alters the motion (RMS) by no
+more than this non-white part (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
 """
 
 from collections.abc import Sequence

@@ -52,7 +52,7 @@ class ShootingEstimate:
     covariance: Array
     """Covariance (parameters, parameters), robust to model errors; see `Segmented.covariance`."""
     zeros: Array
-    """True minus measured angle for each recording (recordings, joints) [rad]; (0, joints) if not estimated."""
+    """Zero errors, true minus measured angle (recordings, joints) [rad]; shape (0, joints) if not estimated."""
     zeros_std: Array
     """Standard errors of `zeros`, with the same shape."""
     residual_rms: Array

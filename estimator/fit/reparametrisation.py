@@ -60,7 +60,7 @@ class Coordinates:
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
-        """Return the point that `step` (coordinates,) reaches from `x`; both arrays may end with other coordinates.
+        """Return the point that `step` (coordinates,) reaches from `x`; both arrays may have further coordinates.
 
         A step changes a width itself rather than its logarithm, since the motion depends linearly on the width. With
         exponential steps, a width would never reach its floor.
@@ -72,7 +72,7 @@ class Coordinates:
         return y
 
     def moved_in_proportion(self, x: Array, step: Array) -> Array:
-        """Return the point that `step` (coordinates,) reaches from `x`; both arrays may end with other coordinates.
+        """Return the point that `step` (coordinates,) reaches from `x`; both arrays may have further coordinates.
 
         Base parameters change linearly with the step, not exponentially. This straightens valleys along which only a
         sum of inertias is determined.
@@ -91,9 +91,8 @@ class Coordinates:
     def limit(self, x: Array, least: Array, most: Array, max_relative_decrease: float) -> None:
         """Tighten, in place, the bounds on the change of each coordinate in one step from `x` (coordinates,).
 
-        The change in a width is limited relative to the width, that in other parameters by their `Term.max_step`. A
-        width that reached its floor, where it hardly affects the motion, would not be increased again by any later
-        step.
+        The change in a width is limited in proportion to the width, and the change in any other parameter by its
+        `Term.max_step`. At its floor, a width would hardly affect the motion, so no later step would increase it again.
         """
         least[: x.size] = np.maximum(least[: x.size], -self._longest)
         most[: x.size] = np.minimum(most[: x.size], self._longest)
@@ -107,7 +106,7 @@ class Coordinates:
             most[index] = min(most[index], room if self._floors[index] else np.log1p(room))
 
     def undisguised(self, x: Array) -> Array:
-        """Return `x` with constant Stribeck rises turned into Coulomb friction; `x` may end with other coordinates.
+        """Return `x` with constant Stribeck rises turned into Coulomb friction; `x` may have further coordinates.
 
         If the Stribeck velocity exceeds all speeds of the motion, only the sum of rise and Coulomb friction is
         determined, and a fit that has drifted so far rarely returns to lower Stribeck velocities.

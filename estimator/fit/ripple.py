@@ -29,7 +29,7 @@ STRIBECK_VELOCITY = 0.15  # rad/s: a rough value suffices to separate the Stribe
 
 
 def find_waves(periods: Sequence[SettledPeriod], linear: LinearEstimate, wave: Wave) -> dict[str, float]:
-    """Return cycles per turn and sine and cosine parts of each joint's ripple [1] or cogging [N m], by parameter."""
+    """Return each joint's cycles per turn and the sine and cosine parts of its ripple [1] or cogging [N m], by name."""
     found: dict[str, float] = {}
     for joint in range(periods[0].joints):
         each = [
@@ -61,7 +61,7 @@ def _parts(each: list[tuple[Array, Array, Array, Array]]) -> list[tuple[Array, i
 def _prepared(
     period: SettledPeriod, motion: PeriodicMotion, harmonics: int, joint: int, delay: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return a joint's columns and torque on the lines as real numbers; its torque and angle over time (samples,)."""
+    """Return a joint's columns and torque on the Fourier lines as real numbers, and both torque and angle over time."""
     Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)[joint]
     velocity = motion.velocity[joint]
     sign = np.tanh(velocity / COULOMB_WIDTH)

@@ -37,7 +37,7 @@ from hil.estimator.simulation.back_emf import limited
 
 DEFAULTS = LikelihoodOptions()
 HARDLY = 0.05
-"""A term added to a model starts, near that model's minimum, at this fraction of its usual initial guess."""
+"""Fraction of its usual initial guess at which a new term starts when it is added to a model near its minimum."""
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,7 @@ def _fit(
 
 
 def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Array) -> tuple[str, ...]:
-    """Return the parameters that lie at a bound although the data favour values beyond it, provided that this affects
+    """Return the parameters that are at a bound although the data favour values beyond it, provided that this affects
     base parameters.
 
     std: standard errors of the parameters `value` (parameters,).
@@ -338,7 +338,7 @@ def _tempered(
 def _model_error(residual: Array, weight: Array, period: SettledPeriod) -> Array:
     """Return the part of each joint's weighted sum of squares that is due to model errors (joints,).
 
-    This is the part that is not white, but at most what exceeds the noise: a slow joint's rounding is not white either.
+    This is the part that is not white, limited to the excess over the noise, since slow joints' rounding is not white.
     """
     squares = np.sum(residual**2, axis=1)
     noise = np.sum((weight * period.noise[:, None]) ** 2, axis=1)

@@ -25,7 +25,7 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
 
     The standard errors are those for independent errors with variance 1. normal (coordinates, coordinates), gradient
     (coordinates,): normal matrix and gradient of the sum of squares. slopes: derivatives of the parameters with respect
-    to their coordinates, which are the first ones (parameters, parameters).
+    to their coordinates, which come first (parameters, parameters).
     """
     # Each coordinate by its own scale: that of a parameter that has run to zero is many orders of magnitude smaller.
     scale = np.sqrt(np.diag(normal))
@@ -39,7 +39,7 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
 
 
 def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Array) -> Mask:
-    """Return which parameters (parameters,) lie at a bound, `lower` or `upper`, although the data favour values beyond
+    """Return which parameters (parameters,) are at a bound, `lower` or `upper`, although the data favour values beyond
     it.
 
     std: standard errors for independent errors. If they were widened for the misfit, a parameter whose bound causes the
@@ -52,7 +52,7 @@ def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Arr
 
 
 def finite_std(std: Array, white: Array) -> Array:
-    """Return the standard errors `std` (parameters,) with infinite ones, as at a bound, replaced by finite ones.
+    """Return the standard errors `std` (parameters,), with infinite values (as at a bound) replaced by finite ones.
 
     white: standard errors for independent errors. They replace infinite ones after being widened by the median factor
     of the other parameters.
@@ -80,10 +80,10 @@ def bound_sentence(names: Sequence[str]) -> str:
     late = any(kind_of(name) == "back_emf" for name in names)
     cause = (
         "The lagging back-EMF already cancels as much of the joint's inertia as is physically possible, so the inertia "
-        "and the lag may be wrong: check the joint's mode and servo model, and that nothing else delays its torque"
+        "and the lag may be wrong: check the joint's mode and servo model, and what else may delay its torque"
         if late
-        else "An effect missing from the model, or too little motion, causes this and distorts other values: use wider "
-        "and faster motion, and look for a cause among the findings above"
+        else "This is due to an effect missing from the model or to too little motion, and it distorts other values: "
+        "use wider and faster motion, and look for a cause among the findings above"
     )
     it, its = ("are", "their") if len(names) > 1 else ("is", "its")
     return f"{', '.join(names)} {it} at {its} bound, although the data favour values beyond it. {cause}."

@@ -76,7 +76,7 @@ class Box:
 def random_lines(rng: np.random.Generator, joints: int, harmonics: int) -> NDArray[np.complex128]:
     """Return Fourier coefficients (joints, harmonics) with random phases and amplitudes.
 
-    The spectra of some joints are steep, for slow and wide motions; those of others are flat, for fast ones.
+    Some joints have steep spectra, which give slow, wide motions; others have flat spectra, which give fast ones.
     """
     slower = np.arange(1, harmonics + 1) ** -rng.uniform(0.0, STEEPEST, (joints, 1))
     lines = rng.standard_normal((joints, harmonics)) + 1j * rng.standard_normal((joints, harmonics))
@@ -165,7 +165,7 @@ class Goal:
 
     @cached_property
     def _response(self) -> Array:
-        """Frequency response of each joint's angle to its torque (joints, lines) [rad/(N m)]."""
+        """Frequency response of each joint's angle to its torque (joints, frequencies) [rad/(N m)]."""
         described = self.base.as_all(self.prior.value)
         inertia = np.diag(mass_matrix(self.base.chain, described, self.box.centre))
         turn = 2j * np.pi * np.arange(self._samples // 2 + 1) / self.box.period

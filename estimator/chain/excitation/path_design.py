@@ -155,7 +155,10 @@ class PathDesigner:
         return float(errors.max()), float(np.median(errors))
 
     def _start(self, random: np.random.Generator, told: Callable[[], None]) -> tuple[Array, Array]:
-        """Return the centre and coefficients of the best random path; the centres are random or the limits' middle."""
+        """Return the centre and coefficients of the best random path.
+
+        The centres tried are the middle of the limits and random points.
+        """
         low, high = self._limits.low, self._limits.high
         best: tuple[float, Array, Array] | None = None
         for number in range(CENTRES):
@@ -199,7 +202,7 @@ class PathDesigner:
         return float((1.0 - _MEAN_SHARE) * errors.max() + _MEAN_SHARE * errors.mean())
 
     def _errors(self, path: Path, every: int) -> Array:
-        """Return the standard errors after one whole period (base parameters,), relative to the prior's."""
+        """Return the base parameters' standard errors after one period, relative to the prior's (base parameters,)."""
         some = slice(0, None, every)
         Y = self._base.regressor(path.position[:, some], path.velocity[:, some], path.acceleration[:, some])
         level = np.sqrt(np.mean((Y @ self._prior.value) ** 2, axis=1) + self._friction**2) + 1e-6

@@ -76,11 +76,11 @@ class ChainCoordinates:
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
-        """Return the point reached by `step` from `x`; both arrays may end with other coordinates.
+        """Return the point reached by `step` from `x`; both arrays may have further coordinates at the end.
 
-        If a recording barely constrains the torque scales of some joints, these and all parameters of their links can
-        change by a common factor. Unless the parameters change exponentially like the scales, a step does not follow
-        this common change, and only tiny steps reduce the sum of squares.
+        If a recording barely constrains the torque scales of some joints, these scales and all parameters of the
+        joints' links can change by a common factor. Steps follow this common change only if the parameters change
+        exponentially, as the scales do; otherwise, only tiny steps reduce the sum of squares.
         """
         y = x + step
         if self.torque_scales.size:
@@ -90,7 +90,7 @@ class ChainCoordinates:
         return y
 
     def raised(self, x: Array) -> Array:
-        """Return `x` with every width at or above its floor; `x` may end with other coordinates."""
+        """Return `x` with every width at or above its floor; `x` may have further coordinates at the end."""
         y = x.copy()
         y[self._widths] = np.maximum(x[self._widths], np.log(self._least[self._widths]))
         return y
@@ -99,7 +99,7 @@ class ChainCoordinates:
         """Return the largest possible decrease in each parameter's coordinate, as a negative number or 0
         (parameters,).
 
-        Only widths have a floor; `x` may end with other coordinates.
+        Only widths have a floor. `x` may have further coordinates at the end.
         """
         least = np.full(len(self.names), -np.inf)
         least[self._widths] = np.minimum(np.log(self._least[self._widths]) - x[self._widths], 0.0)

@@ -20,7 +20,7 @@ class HeldZeros:
     """Encoder zeros of all joints but the first, as far as the recording determines them."""
 
     shift: Array
-    """Estimated true minus measured angle (joints - 1,) [rad]; close to 0 if gravity does not reveal it."""
+    """Estimated zero errors, true minus measured angle (joints - 1,) [rad]; near 0 if gravity does not reveal them."""
     gain: float
     """Expected decrease in the sum of squares if the zeros were fitted, in units of the white-noise variance."""
 

@@ -109,7 +109,7 @@ class ChainProblem:
         )
 
     def _measured(self, period: SettledPeriod) -> Array:
-        """Return the measured angles to be compared (samples, joints) [rad]."""
+        """Return the measured angles that are compared (samples, joints) [rad]."""
         return np.ascontiguousarray(period.position.T[:: self.every][: period.samples // self.every])
 
     def _thinned(self, of_steps: Array) -> Array:
@@ -130,9 +130,9 @@ class ChainProblem:
         return self._with_prior(x, self._of_data(x))
 
     def tempered(self, x: Array) -> tuple["ChainProblem", Quadratic]:
-        """Return the problem and the sum of squares at `x`. The prior's weight becomes the mean squared residual at `x`
-        relative to the assumed noise, but at least 1.
+        """Return the problem with the prior reweighted, and its sum of squares at `x`.
 
+        The prior's weight becomes the mean squared residual at `x` relative to the assumed noise, but at least 1.
         Repeated readings have the same reduced weight as in the sum of squares.
         """
         data = self._of_data(x)
@@ -331,7 +331,7 @@ class ChainProblem:
         return self.added[index] if self.added else None
 
     def _of_period(self, index: int, parameters: dict[str, float]) -> dict[str, float]:
-        """Return the parameters of the equivalent arm (`as_moving`) in a period, including the mass added in it."""
+        """Return the parameters of the equivalent arm (`as_moving`) in a period, including any mass added to it."""
         parameters, added = as_moving(self.model.base, parameters), self._added(index)
         if added is None:
             return parameters

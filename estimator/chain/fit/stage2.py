@@ -194,7 +194,7 @@ def _fit(
 
 
 def _at_bound(problem: ChainProblem, minimum: Minimum, value: Array, std: Array) -> tuple[str, ...]:
-    """Return the parameters that lie at a bound although the data favour values beyond it, if this affects base
+    """Return the parameters that are at a bound although the data favour values beyond it, if this affects base
     parameters or viscous or dry friction.
 
     std: standard errors of the parameters `value` (parameters,).
@@ -213,7 +213,7 @@ def _at_bound(problem: ChainProblem, minimum: Minimum, value: Array, std: Array)
 
 
 def _larger(one: Array, other: Array) -> Array:
-    """Return a covariance at least as large as both; infinite where one of them is."""
+    """Return a covariance at least as large as both; infinite where either is infinite."""
     length = np.sqrt(np.maximum(np.diag(one), np.diag(other)))
     known = np.flatnonzero(np.isfinite(length) & (length > 0.0))
     at, lengths = np.ix_(known, known), np.outer(length[known], length[known])

@@ -69,11 +69,11 @@ class _Spectrum:
 
     joint: int
     lines: NDArray[np.complex128]
-    """Jacobian for scaled coordinates (lines, coordinates), normalised as in a real orthonormal transform."""
+    """Jacobian for scaled coordinates (frequencies, coordinates), normalised as in a real orthonormal transform."""
     power: Array
-    """Power of the residual (lines,); 1 for white noise with the variance that the weights assume."""
+    """Power of the residual (frequencies,); 1 for white noise with the variance that the weights assume."""
     share: Array
-    """Leverage: fraction of the noise on each line that the fit absorbs (lines,)."""
+    """Leverage: fraction of the noise at each frequency that the fit absorbs (frequencies,)."""
     stands_for: float
     """Ratio of the period's number of samples to the number used for the Jacobian."""
 

@@ -24,15 +24,16 @@ ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, i
 SAMPLES = 150
 KINDS = (slice(1, 4), slice(4, 10), slice(10, 11), slice(0, 1))  # moments, inertias, armature, mass
 CLEARLY_INDEPENDENT = 0.1
-"""A column is kept at once if the part of it that the columns kept so far do not explain has a norm above this.
+"""A column is kept at once if its unexplained part has a norm above this value.
 
-The norm is relative to the largest column of the same link and kind.
+This is the part that the columns kept so far do not explain. Its norm is relative to the largest column of the same
+link and kind.
 """
 INDEPENDENT = 2e-3
-"""A column is kept in the end if its unexplained part, as in CLEARLY_INDEPENDENT, has a norm above this value.
+"""A remaining column is kept if its unexplained part (see CLEARLY_INDEPENDENT) has a norm above this value.
 
-Rounded angles such as 1.57 or 1.5708 in a description make every parameter slightly independent. No recording would
-determine such a parameter.
+Rounded angles such as 1.57 or 1.5708 in a description give every parameter a tiny effect of its own. No recording would
+determine a parameter from that.
 """
 LEAST_FACTOR = 1e-7  # of a group
 NOTHING = 1e-9
@@ -42,7 +43,7 @@ NOTHING = 1e-9
 class BaseParameters:
     """The base parameters of a chain.
 
-    Each is named after the one parameter of its group to which it reduces when the others are zero.
+    Each is a combination of parameters, named after the one to which it reduces if the others are zero.
     """
 
     chain: Chain

@@ -55,7 +55,7 @@ def regressor(
 
 
 def places(joints: int, chosen: Columns) -> Columns:
-    """Return each link parameter's index among the chosen ones, or their number if it was not chosen (joints, 11)."""
+    """Return the index of each link parameter among the chosen ones; `chosen.size` if it is not chosen (joints, 11)."""
     column = np.full(TERMS * joints, chosen.size)
     column[chosen] = np.arange(chosen.size)
     return column.reshape(joints, TERMS)

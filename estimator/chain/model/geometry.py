@@ -46,7 +46,7 @@ class Chain:
                 "(joints, 3, 3), (joints, 3), (joints, 3) and (3,)"
             )
         if not 1 <= joints <= MOST_JOINTS:
-            raise ModelError(f"a chain of {joints} joints: it must have one to {MOST_JOINTS}")
+            raise ModelError(f"the chain has {joints} joints; it must have 1 to {MOST_JOINTS}")
         if np.abs(np.linalg.norm(self.axis, axis=1) - 1.0).max() > 1e-6:
             raise ModelError("the joints' axes must have length 1")
         turned = self.rotation @ np.swapaxes(self.rotation, 1, 2)

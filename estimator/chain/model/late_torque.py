@@ -15,10 +15,10 @@ from hil.estimator.arrays import Array
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 
-MEANINGS = {"lag_ratio": "ratio of the lag of the joint's current loop to joint 1's"}
+MEANINGS = {"lag_ratio": "ratio of the lag of the joint's current loop to that of joint 1"}
 """Meanings of the kinds of parameters specific to chains."""
 PART = 0.1
-"""`limited` names a joint's back-EMF only if its part in the motion that loses the most inertia exceeds this."""
+"""`limited` names the back-EMF of a joint that contributes more than this to the motion that loses the most inertia."""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
 _ARMATURE = 10  # of a link's parameters
@@ -59,7 +59,7 @@ def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -
     This limit biases the estimated inertias. A back-EMF is named only if the inertia that it would cancel exceeds the
     standard error of a base parameter.
 
-    std: standard errors of the base parameters; those of other parameters may follow.
+    std: standard errors of the base parameters, optionally followed by those of other parameters.
     """
     generating = _generating(base.chain.joints, parameters)
     most, parts = _most_lost(base, parameters, generating)
@@ -85,7 +85,7 @@ inertia [kg m^2] per unit of each parameter that its lagging back-EMF depends on
 
 
 def losses(base: BaseParameters, parameters: Mapping[str, float], names: tuple[str, ...]) -> Losses:
-    """Return, for `complete`, the derivatives of lost inertias with respect to the parameters that cause the loss.
+    """Return the derivatives of lost inertias with respect to the parameters that cause the loss; see `complete`.
 
     names: the parameters with respect to which to differentiate; the base parameters come first.
     """
@@ -132,7 +132,7 @@ def _generating(joints: int, parameters: Mapping[str, float]) -> list[tuple[int,
 def _possible(
     base: BaseParameters, parameters: Mapping[str, float], generating: Sequence[tuple[int, float, float, float]]
 ) -> float:
-    """Return the factor, at most 1, that keeps the inertia lost by lagging back-EMF within what is possible."""
+    """Return the factor, at most 1, that keeps the inertia lost by a lagging back-EMF within the physical limit."""
     most, _ = _most_lost(base, parameters, generating)
     return min(1.0, MOST_LOST / most) if most > 0.0 else 1.0
 

@@ -1,4 +1,7 @@
-"""Weak prior, from a description of the arm, on base parameters and torque constants that the data do not determine."""
+"""Weak prior on base parameters and torque constants that the data do not determine.
+
+It is derived from a description of the arm.
+"""
 
 from dataclasses import dataclass
 
@@ -31,7 +34,7 @@ class Prior:
     def surpassing(self, names: tuple[str, ...], std: Array) -> tuple[str, ...]:
         """Return the base parameters whose standard errors exceed the prior's.
 
-        std: standard errors of the base parameters; those of other parameters may follow.
+        std: standard errors of the base parameters, optionally followed by those of other parameters.
         """
         return tuple(
             name for name, each, own in zip(names, std[: self.std.size], self.std, strict=True) if not each <= own

@@ -30,7 +30,7 @@ def tilt_axes(gravity: Array) -> Array:
 
 
 def tilted(gravity: Array, x: float, y: float) -> Array:
-    """Return `gravity`, given in the frame of the nominal base, in that of a base tilted by these angles."""
+    """Transform `gravity` from the frame of the nominal base to the frame of a base tilted by these angles."""
     size = float(np.linalg.norm(gravity))
     if size == 0.0 or (x == 0.0 and y == 0.0):
         return np.array(gravity)

@@ -91,7 +91,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Pull:
-    """Torque that grows while a joint is off its path, so that friction and unknown weights do not hold it there.
+    """Torque that grows while a joint is off its path, so that friction and unknown weights cannot hold it back.
 
     path: positions (samples, joints) [rad]. per_second: growth relative to the spring's torque [1/s]. share: maximum of
     this torque, as a fraction of the joint's largest torque.
@@ -144,7 +144,10 @@ def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = No
 
 
 def _pull_of(loop: Loop) -> tuple[Array, Array, Array]:
-    """Return the path (samples, joints), possibly empty, growth per sample and rad (joints,), and maximum (joints,)."""
+    """Return the path (samples, joints), the growth per sample and rad (joints,), and the maximum (joints,).
+
+    The path is empty if there is no such torque.
+    """
     if loop.pull is None:
         return np.empty((0, len(loop.limit))), np.zeros_like(loop.limit), np.zeros_like(loop.limit)
     return loop.pull.path, loop.pull.per_second / loop.rate * loop.stiffness, loop.pull.share * loop.limit

@@ -147,10 +147,10 @@ def _multiply(A: Any, X: Any, inner: int, out: Any) -> None:
 
 
 def _solve_for(inverse: Any, mixed: Any, columns: int, first: int, A: Any) -> None:
-    """Set A to -inverse [mixed, 1], in the order of the rows of `z` in `_run_loop`.
+    """Set A to -inverse [mixed, 1], with its columns in the order of the rows of `z` in `_run_loop`.
 
-    mixed: coefficients (`columns` in all) of the derivatives of angles and velocities, then of accelerations, which are
-    in `z` from row `first` on. The coefficient of the direct derivatives is 1.
+    mixed: coefficients of the derivatives of angles and velocities, then of the derivatives of accelerations, which
+    start at row `first` of `z`. columns: number of these coefficients. Direct derivatives have the coefficient 1.
     """
     n = inverse.shape[0]
     for i in range(n):
@@ -228,8 +228,8 @@ def _follow(
 def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:
     """Return the number of smaller steps, at most `most`, that replace this one.
 
-    A joint that may pass through the steep part of its friction crosses at most CROSSED widths in each. A joint that
-    sticks needs no smaller steps. k: last accelerations.
+    A joint that may pass through the steep part of its friction crosses at most CROSSED widths per smaller step. A
+    joint that sticks needs no smaller steps. k: last accelerations.
     """
     needed = 1.0
     for j in range(v.size):
@@ -242,7 +242,7 @@ def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:
 def _broken(p: Any, v: Any, k: Any, t: Any, solve: Any, step: float, most: int) -> int:
     """Return the number of smaller steps, at most `most`, into which to divide a step after its first stage.
 
-    `_pieces` cannot predict that a joint breaks away from standstill. Friction at the end of the stage then differs
+    `_pieces` cannot predict that a joint will break away from standstill. Friction at the end of the stage then differs
     from the tangent that the stage assumed; the velocity error that this difference causes is limited to CROSSED
     widths. k: accelerations of the stage. t: motor torques. solve: as `_stage` left it.
     """
