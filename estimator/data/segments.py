@@ -13,7 +13,8 @@ from hil.estimator.errors import RecordingError
 Indices = npt.NDArray[np.int64]
 
 LONGEST_STEP = 1e-3  # s
-FEWEST = 8  # samples in a segment
+FEWEST = 8
+"""Fewest samples in a segment."""
 START_WINDOW = 0.03  # s before and after a segment's start, used to estimate its initial state
 DIFFERENCE = 1e-7  # s
 

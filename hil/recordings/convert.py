@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hil.config.csv_columns import TICKS, Columns
 from hil.errors import CsvError
 from hil.estimator.data.recording import FEWEST_SAMPLES, LEAST_MOTION, LONGEST_GAP, Recording
+from hil.estimator.data.segments import FEWEST
 from hil.estimator.errors import RecordingError
 from hil.recordings.clean import Rows, cleaned
 from hil.recordings.encoder import encoder_step
@@ -43,9 +44,6 @@ class Converted:
     doubts: tuple[str, ...] = ()
     unusable: bool = False
 
-
-_FEWEST_IN_A_SEGMENT = 6
-"""Fewest samples in a segment: its initial state alone has two unknowns per joint."""
 
 
 def convert(table: Table, columns: Columns) -> Converted:
@@ -90,10 +88,10 @@ def convert(table: Table, columns: Columns) -> Converted:
     except RecordingError as error:
         raise CsvError(f"{table.source}: {error}") from error
     between = min(float(np.median(np.diff(each.time))) for each in recordings)
-    if whole.segment < _FEWEST_IN_A_SEGMENT * between:
+    if whole.segment < FEWEST * between:
         raise CsvError(
             f"{table.source}: columns.segment = {whole.segment:g} s: a segment must hold at least "
-            f"{_FEWEST_IN_A_SEGMENT} samples, here {_FEWEST_IN_A_SEGMENT * between:.2g} s."
+            f"{FEWEST} samples, here {FEWEST * between:.2g} s."
         )
     names = tuple(
         table.source if len(long) == 1 else f"{table.source}, part {number}" for number in range(1, len(long) + 1)

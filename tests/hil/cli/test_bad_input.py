@@ -128,7 +128,7 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate nowhere.csv", 2, "nowhere.csv"),
     ("estimate file", 2, "file"),
     ("estimate .", 2, "not a run folder"),
-    ("estimate good.csv --config short.toml", 2, "columns.segment = 1e-06 s: a segment must hold at least 6 samples"),
+    ("estimate good.csv --config short.toml", 2, "columns.segment = 1e-06 s: a segment must hold at least 8 samples"),
     ("estimate good.csv good.csv --config columns.toml", 2, "good.csv and good.csv hold the same samples"),
     ("estimate . --config columns.toml", 2, "not a run folder"),
     ("estimate empty.csv", 2, "is empty"),
