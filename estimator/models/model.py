@@ -50,7 +50,7 @@ class Model:
             encoder_sin_twice sin 2q + encoder_cos_twice cos 2q.
         lags: adds lag_difference to the lag of the second joint's torque or, without a lag, to its delay.
 
-    Raises ModelError for an unknown name, for torque_scale with one joint, and for any number of joints except one or two.
+    Raises ModelError for an unknown name, for torque_scale with one joint, and unless the arm has one or two joints.
     """
 
     joints: int

@@ -129,7 +129,8 @@ class MomentumObserver:
         joints = len(largest)
         if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
             raise ValueError(
-                f"{joints} joints and a covariance of shape {covariance.shape}: expected 1 or 2 joints and the shape (14, 14)"
+                f"{joints} joints and a covariance of shape {covariance.shape}: expected 1 or 2 joints and a shape of "
+                "(14, 14)"
             )
         self._joints = joints
         self._memory = np.zeros((_GAIN + 1, _COUNT))
@@ -242,7 +243,7 @@ def _gain(m: Any, i: int, row: Any) -> float:
 
 
 def _learn(m: Any, row: Any, gain: Any, lacking: float, spread: float, first: int) -> None:
-    """Update the parameters from index `first` on, allowing for the uncertainty of the others (Schmidt-Kalman filter)."""
+    """Update the parameters from index `first` on, with the others' uncertainty considered (Schmidt-Kalman filter)."""
     for i in range(_COUNT):
         gain[i] = _gain(m, i, row)
     for i in range(_COUNT):

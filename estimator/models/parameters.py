@@ -51,7 +51,7 @@ class Physics:
     encoder: Array = field(default_factory=lambda: np.zeros((2, len(ENCODER))))
     """Encoder errors by joint, in the order of ENCODER (2, terms) [rad]."""
     lag_difference: float = 0.0
-    """Lag of the second joint's torque minus the lag of the first joint's torque [s]; without a lag, the difference in delay."""
+    """Lag of joint 2's torque minus lag of joint 1's torque [s]; without a lag, the difference in delay."""
 
     @classmethod
     def of(cls, parameters: Mapping[str, float]) -> "Physics":

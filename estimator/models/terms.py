@@ -2,8 +2,8 @@
 
 Fits, results, reports, exports and the configuration take names, units, descriptions, ranges, initial guesses and
 scales from here; docs/architecture.md lists the files to change for a new term. Parameters are named `term_joint`, with
-joints counted from 1, while a parameter of the whole arm is named just `term`. This module imports only the standard library,
-so that reading a result is fast.
+joints counted from 1, while a parameter of the whole arm is named just `term`. This module imports only the standard
+library, so that reading a result is fast.
 """
 
 import re
@@ -70,8 +70,8 @@ OPTIONS: dict[Option, str] = {
 }
 """Optional parts of a model and their descriptions; also keys of `[model]`."""
 BEYOND_SPEEDS = 3.0
-"""Stribeck velocity, as a multiple of a joint's highest speed, for which the Stribeck rise falls by at most a tenth within
-the recorded range of speeds.
+"""Stribeck velocity, as a multiple of a joint's highest speed, for which the Stribeck rise falls by at most a tenth
+within the recorded range of speeds.
 """
 
 
@@ -100,7 +100,7 @@ class Term:
     either sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of the two terms whose geometric mean bounds this term. If this is a term of each joint, they are those of the
+    """Names of the two terms whose geometric mean bounds this term. If this is a term of each joint, both belong to the
     same joint.
     """
     scale: Scale | float = 1.0
@@ -140,7 +140,7 @@ _DECLARED = (
     Term(
         "inertia",
         "kg m^2",
-        "inertia of the joint's link about the joint; for joint 1, including its rotor and the mass at the end of link 1",
+        "inertia of the joint's link about the joint; for joint 1, including its rotor and the mass at the link's end",
         part="base",
         scale="inertia",
     ),

@@ -45,7 +45,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Choice:
-    """The models tried, in order, and the chosen one."""
+    """The models tried, in order, and which of them was chosen."""
 
     trials: tuple[Trial, ...]
     chosen: Trial
