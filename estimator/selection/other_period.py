@@ -32,7 +32,7 @@ def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
 
 
 def _from_before(physics: Physics, other: SettledPeriod, before: Array) -> Array:
-    """Return the mean of the simulated periods, without the first one, which starts in the state `before` (2, joints)."""
+    """Return the mean of all simulated periods but the first, which starts in the state `before` (2, joints)."""
     start = np.stack((without_errors(physics, before[0][:, None])[:, 0], before[1]))
     periods = (
         _free(physics, other, start) if other.stabiliser is None else _held(physics, other, other.stabiliser, start)

@@ -289,7 +289,7 @@ class Selection:
         return self._try_or_none(trial.model, trial) or trial
 
     def _restarted(self, best: Trial) -> Trial:
-        """Refit the model from other initial guesses until the motion of every joint is explained or no guess remains."""
+        """Refit the model from other initial guesses until every joint's motion is explained or no guess remains."""
         left, improved = self._options.max_restarts, True
         while improved and best.estimate is not None:
             improved = False

@@ -1,4 +1,4 @@
-"""Checks of an estimate: residual relative to noise, whiteness, conditioning, open-loop simulation, Fourier spectrum."""
+"""Checks of an estimate: residual relative to noise, whiteness, conditioning, open-loop simulation, spectrum."""
 
 from dataclasses import dataclass
 

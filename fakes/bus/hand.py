@@ -74,7 +74,8 @@ class _Grip:
 class Hand:
     """The hand of one bus. Times are in seconds since the bus was created.
 
-    tell: called whenever a move, grip or release may have changed `busy`: while busy, the hand needs the bus's ticks.
+    tell: called whenever a move, grip or release may have changed `busy`. While the hand is busy, it needs the bus's
+    ticks.
     """
 
     def __init__(self, joints: Joints, plant: Plant, time: Callable[[], float], tell: Callable[[], None]) -> None:

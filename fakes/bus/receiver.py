@@ -25,7 +25,7 @@ class Receiver:
         self._framer = Framer(damaged=True)
         self._length = 0
         self._asked: dict[bytes, Packet] = {}
-        """Cache of group reads, keyed by their bytes, since a host sends the same reads repeatedly."""
+        """Cache of parsed group reads, keyed by their bytes; a host sends the same reads repeatedly."""
 
     def feed(self, data: bytes) -> list[tuple[Packet, int]]:
         """Take bytes as they arrive; return each complete packet and the number of bytes that follow it."""

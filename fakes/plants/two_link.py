@@ -116,8 +116,8 @@ def _run(  # noqa: PLR0912, PLR0915
 ) -> State:
     """Integrate over `remaining` [s] in steps of at most `longest` [s] with commanded currents [A].
 
-    This is one long loop on local floats because a fake arm spends most of its time here: with a function call per step
-    it takes 1.5 times as long. A step in which a joint's velocity changes sign is first taken up to that point (`cut`).
+    This is one long loop with local floats because a fake arm spends most of its time here: with a function call per
+    step, it takes 1.5 times as long. A step in which a joint's velocity changes sign is split at that point (`cut`).
 
     arm: `TwoLink._terms`. drives: `Motor.plain` of both motors. motors: None if both are plain, the only compiled case.
     """
@@ -266,7 +266,7 @@ def _shrunk(impulse: float, limit: float) -> float:
 
 @cache
 def _compiled() -> Callable[..., State]:
-    """Return the compiled loop; from then on, the interpreted loop also calls compiled functions."""
+    """Return the compiled loop; after this call, the interpreted loop calls compiled functions, too."""
     import numba
 
     inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]

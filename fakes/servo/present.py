@@ -181,7 +181,7 @@ class Present:
         self._memory.set("Realtime Tick", tick)
 
     def forget_turns(self, position: float) -> None:
-        """Reset Present Position at a joint angle [rad] to its value within one turn, before Homing Offset."""
+        """Remove whole turns from Present Position, before Homing Offset is added, at a joint angle [rad]."""
         self._turn_ticks = 0
         self._shift_changed()
         raw = round(self.ticks(position)) - self._homing_ticks()
