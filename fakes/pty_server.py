@@ -31,7 +31,9 @@ OVERRUN_S = 1e-3
 """A reply delivered more than this long after it was due counts as a real-time overrun [s]."""
 
 TOO_SLOW_S = 5e-3
-"""Tolerated excess of computing time over simulated time [s]; if exceeded twice in a row, the rest is skipped."""
+"""Tolerated excess of computing time over simulated time [s]. If it is exceeded twice in a row, the server skips the
+time beyond it.
+"""
 
 LONGEST_SLEEP_S = 0.05
 """Longest wait before the server checks for faults, watchdog trips and a request to stop [s]."""

@@ -35,7 +35,7 @@ _CHECKS = {
     "zero": "check zero_ticks and the horn's position",
     "base_tilt": "check arm.base",
     "encoder": "check the encoder and its magnet",
-    "stribeck_velocity": "use slower motion to separate friction near standstill",
+    "stribeck_velocity": "use slower motion, so that friction near standstill can be determined",
 }
 _DRIVE = "check the joint's servo model and mode"
 _LINK = "correct that link's mass, centre of mass and inertia in the description, or check what the arm carries"

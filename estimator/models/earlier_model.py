@@ -26,7 +26,7 @@ TIMES = 3.5
 
 RELATIVE_STD = 0.1
 """Relative standard deviation of each term of the mean (inertia, gravity, friction). A model that fits one motion is
-not exact in the next: in a fast swing, terms several times as large as the commanded torque cancel.
+not exact in the next: in a fast swing, terms several times as large as the commanded torque cancel each other.
 """
 
 IN_A_ROW = 2

@@ -35,8 +35,8 @@ class Model:
     Options:
         presliding: replaces coulomb_width by bristles that deflect before they slip
             (`hil.estimator.simulation.bristles`).
-        asymmetry: adds viscous_asymmetry |v|, friction that depends on direction (for the Coulomb level, the offset
-            does this).
+        asymmetry: adds viscous_asymmetry |v|, friction that depends on direction (the offset covers a
+            direction-dependent Coulomb level).
         ripple: multiplies the motor torque by 1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q),
             where ripple_cycles is the number of cycles per turn of the joint.
         cogging: adds cogging_sin sin(cogging_cycles q) + cogging_cos cos(cogging_cycles q) to the torque.

@@ -138,7 +138,7 @@ def torque_change(period: SettledPeriod, estimate: Estimate) -> TorqueChange:
 def _fitted(later: "_Later", period: SettledPeriod, most: float | Array) -> tuple[Array, Array, float]:
     """Return the change (joints,), its standard error and the remaining sum of squares.
 
-    most: largest change in one iteration.
+    most: largest permitted change in one iteration.
     """
     joints = period.joints
     change, state = np.zeros(joints), _first_state(period)

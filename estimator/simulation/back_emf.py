@@ -10,8 +10,8 @@ This is exact for a joint of inertia J, which moves as if its inertia were small
 subtracts back_emf viscous (lag + delay) from the joint's own inertia: 5 to 10 % of it on an XL430. The estimated lag is
 lag', slightly larger than that of the winding.
 
-If the voltage is later than the back-EMF by d, because a goal waits for the servo's control loop, the estimated inertia
-is too large by b d, whatever the lag.
+If the voltage is delayed by d relative to the back-EMF, because a goal waits for the servo's control loop, the
+estimated inertia is too large by b d, whatever the lag.
 
 Ripple, saturation and load-dependent friction act on the motor's torque, which is the torque of the voltage minus the
 torque of the back-EMF (`hil.estimator.simulation.arm`).
@@ -77,8 +77,8 @@ def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Arr
 def neglected_inertia(brake: float, lost: float, inertia: float, delay: float) -> float:
     """Return the standard deviation of a joint's inertia due to effects that this model neglects [kg m^2].
 
-    The effect of friction on the motor's current is late by lag' - lag. On most arms this is negligible, but it amounts
-    to 5 % of the inertia of an XL430 with hardly any load. The delay d of the voltage contributes 1 to 2 %.
+    The effect of friction on the motor's current is delayed by lag' - lag. On most arms this is negligible, but it
+    amounts to 5 % of the inertia of an XL430 with hardly any load. The delay d of the voltage contributes 1 to 2 %.
 
     brake: b [N m s/rad]. lost: b lag' [kg m^2]. delay: pure delay [s]; part or all of it may affect only the voltage.
     """

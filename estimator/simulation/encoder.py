@@ -37,7 +37,7 @@ def slopes_without_errors(physics: Physics, position: Array) -> Array:
 
 
 def by_motion(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the parameters among `names` on which the motion depends if no spring pulls the arm to a reading."""
+    """Return the parameters in `names` that affect the motion if no spring pulls the arm to encoder readings."""
     return tuple(name for name in names if kind_of(name) not in ENCODER)
 
 

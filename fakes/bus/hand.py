@@ -4,8 +4,8 @@
     bus.hand.move(Move(servo=2, ticks=3000, at=4.0, duration=2.0))
     bus.hand.release(2)
 
-Moves can also be given in TOML, as `[[fake.moves]]` with the same keys, on the command line, as `--move 2:to=0.5,at=4`,
-and, while a fake terminal is being served, with `hil hand /tmp/arm 2:to=0.5`.
+Moves can also be given in TOML, as `[[fake.moves]]` with the same keys; on the command line, as `--move 2:to=0.5,at=4`;
+and with `hil hand /tmp/arm 2:to=0.5`, while a fake terminal is being served.
 
 The hand overcomes friction and gravity but never opposes motor torque: it does not grip a joint whose torque is on, and
 releases a joint as soon as one of its servos switches torque on.

@@ -19,7 +19,7 @@ _packet = partial(tuple.__new__, Packet)  # half the time of Packet(...)
 
 
 class Receiver:
-    """Finds packets like `hil.drivers.packet.Framer(damaged=True)`, with a fast path for complete, valid ones."""
+    """Finds packets as `hil.drivers.packet.Framer(damaged=True)` does, with a fast path for complete, valid ones."""
 
     def __init__(self) -> None:
         self._framer = Framer(damaged=True)

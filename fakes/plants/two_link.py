@@ -7,9 +7,9 @@ Kinetic energy, where w1 = q1' and w2 = q1' + q2' are the links' angular velocit
     link 2      m2 (l1^2 w1^2 + c2^2 w2^2 + 2 l1 c2 w1 w2 cos(phi2 - phi1)) / 2 + J2 w2^2 / 2
     rotors      n1^2 Jr1 q1'^2 / 2 + n2^2 Jr2 q2'^2 / 2
 
-Lagrange's equations are derived in phi1, phi2, whose generalised forces are tau1 - tau2 and tau2; in the joint angles,
-the first equation is their sum, and the second remains the same. The estimator models the same arm independently, as a
-regressor in base parameters; a test compares the two.
+Lagrange's equations are derived in phi1, phi2, whose generalised forces are tau1 - tau2 and tau2. In the joint
+angles, the first equation is the sum of both equations, and the second remains the same. The estimator models the same
+arm independently, as a regressor in base parameters; a test compares the two.
 
 Time integration is symmetric and second-order: drift half a step, kick with the step's mean motor torque and the
 friction at its middle, drift half a step. Dry friction is an impulse on each joint, limited to the friction level times

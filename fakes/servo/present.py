@@ -98,7 +98,7 @@ class Present:
     def clear(self, body: bytes, moving: bool, position: float) -> int:
         """Execute the instruction Clear (reset the turn count); return the error number.
 
-        Errors other than Result Fail are uncertain.
+        Whether real servos return the same error numbers is uncertain, except for Result Fail.
         """
         if len(body) != len(_CLEAR_TURNS):
             return StatusError.DATA_LENGTH
