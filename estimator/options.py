@@ -27,7 +27,7 @@ class MinimiserOptions:
     unfinished: float = 1e-2
     """After `max_iterations`, a relative decrease below this still counts as converged."""
     initial_damping: float = 1e-3
-    """Initial damping, as a fraction of the squared norm of each coordinate's column."""
+    """Initial damping, as a fraction of the squared norm of the Jacobian's column for each coordinate."""
     min_damping: float = 1e-9
     max_damping: float = 1e3
 
@@ -76,7 +76,8 @@ class LinearOptions:
     """Options for stage 1, the regression on Fourier lines."""
 
     coulomb_width: float = 0.05
-    """Width of the smoothed Coulomb step [rad/s]: roughly the velocity error of a sticking joint due to omitted lines.
+    """Width of the smoothed Coulomb step [rad/s]: roughly the velocity error of a sticking joint that results from
+    omitting Fourier lines.
     """
     max_condition: float = 1e8
 
@@ -88,11 +89,13 @@ class CovarianceOptions:
     max_lag: int = 400
     """Maximum lag [samples]."""
     max_lag_share: float = 0.05
-    """Maximum lag as a fraction of a run."""
+    """Maximum lag as a fraction of a run's length."""
     min_lag: int = 4
     """Minimum lag [samples]."""
     min_window_share: float = 0.005
-    """Minimum window as a fraction of a run: rounding errors are slightly correlated beyond their apparent range."""
+    """Minimum window as a fraction of the longest run's length. Rounding errors are slightly correlated even beyond the
+    lag at which they appear uncorrelated.
+    """
 
 
 @dataclass(frozen=True)
@@ -192,7 +195,7 @@ class ShootingOptions:
     are hundredths of a standard error.
     """
     start_segments: int = 80
-    """Maximum number of segments, evenly spread, in the fits that only need to come close to a minimum."""
+    """Maximum number of segments, evenly distributed, in the fits that only need to come close to a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-3)
     """The lower bound on widths is 3e-3 rad/s: smaller widths are slow to simulate and have no visible effect within a
     second.
@@ -226,7 +229,7 @@ class CalibrationOptions:
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""
     difference: float = 1e-6
-    """Step of finite differences, in units of a coordinate."""
+    """Step of the finite differences, in units of the coordinates."""
 
 
 @dataclass(frozen=True)
@@ -237,7 +240,7 @@ class SettlingOptions:
     atol: float = 1e-7
     """Motion counts as periodic if a period changes the state by no more than this [rad and rad/s]."""
     acceptable: float = 1e-5
-    """Change that is accepted after `max_periods`; far below any encoder step [rad and rad/s]."""
+    """Change per period that is still accepted after `max_periods` [rad and rad/s]; far below any encoder step."""
 
 
 @dataclass(frozen=True)
@@ -251,7 +254,9 @@ class SelectionOptions:
     near_residual: float = 5.0
     """RMS residual in units of the noise below which a richer model's fit starts at the simpler model's minimum."""
     steady_residual: float = 5.0
-    """RMS residual in units of the noise below which friction is checked for changes; a worse model may imitate one."""
+    """RMS residual in units of the noise below which changes in friction are searched for; a larger model error may
+    look like one.
+    """
     presliding_residual: float = 1.2
     """RMS residual in units of the noise above which a fit with presliding is tried; such fits are slow."""
     initial_widths: tuple[float, ...] = (5e-4, 2e-2)

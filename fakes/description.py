@@ -41,7 +41,7 @@ class FakeServo(Described):
     direction: Annotated[int, Field(description="-1 if the servo turns in the opposite direction to the joint")] = 1
     joint: Annotated[
         int | None,
-        Field(ge=1, description="joint it moves, counted from 1; by default the one after the previous servo's"),
+        Field(ge=1, description="joint that it moves, counted from 1; by default, the previous servo's joint plus 1"),
     ] = None
     firmware: Annotated[int, Field(ge=38, le=255, description="Firmware Version")] = 48
     baud: Annotated[int, Field(description="baud rate to which the servo is set")] = 1_000_000
@@ -66,7 +66,8 @@ class FakeServo(Described):
     ] = False
     thermal: Annotated[Thermal | None, Field(description="heating by the motor current; none by default")] = None
     overload: Annotated[
-        Overload | None, Field(description="conditions of its overload shutdown; by default it never shuts down")
+        Overload | None,
+        Field(description="conditions for an overload shutdown; by default, the servo never shuts down"),
     ] = None
     registers: Annotated[
         dict[str, int], Field(description="values of other EEPROM registers that differ from the factory defaults")
@@ -145,7 +146,7 @@ class FakeArm(Described):
         count = max(self.joints) + 1
         if set(self.joints) != set(range(count)):
             moved = ", ".join(str(joint + 1) for joint in self.joints)
-            raise ValueError(f"servos: they move joints {moved}, but every joint from 1 upwards needs a servo")
+            raise ValueError(f"servos: they move joints {moved}, but every joint from 1 to the highest needs a servo")
         arm = self.arm or self.chain
         if arm is not None and count != len(arm.drives):
             servos = f"{len(ids)} servos" + (f" on {count} joints" if count != len(ids) else "")
@@ -185,9 +186,9 @@ class FakeArm(Described):
 
 
 def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the [fake] table with the path of its chain's URDF resolved against the TOML file's folder.
+    """Return the [fake] table with the path of its chain's URDF resolved relative to the TOML file's `folder`.
 
-    If that file does not exist, a file of the same name in the TOML file's own folder is used, as in a run folder.
+    If there is no file at that path, a file of the same name in `folder` itself is used, as in a run folder.
     """
     chain = values.get("chain")
     if not isinstance(chain, dict) or not isinstance(chain.get("urdf"), str):
@@ -196,7 +197,7 @@ def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def found_beside(folder: Path, name: str) -> Path:
-    """Return the file `name` of a TOML file in `folder` or, if it does not exist, its namesake in `folder` itself."""
+    """Return the path `name` relative to `folder`; if only `folder` itself has a file of that name, return its path."""
     named = folder / name
     return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name
 

@@ -158,7 +158,7 @@ class FakeSerial(SerialBase):
         bus.discard_input()
 
     def reset_output_buffer(self) -> None:
-        """Do nothing except check that the port is open: what was written is already being sent."""
+        """Check that the port is open, and do nothing else: all data written are already being sent."""
         self._open_bus()
 
     def _open_bus(self) -> FakeBus:
@@ -172,7 +172,7 @@ class FakeSerial(SerialBase):
         return bus
 
     def _unplugged(self, bus: FakeBus) -> _Unplugged:
-        """Wait until the cable is unplugged, which the bus may know in advance, and return the error."""
+        """Wait until the cable is unplugged (the bus may have computed this ahead of time); return the error."""
         self.clock.wait_until(bus.pulled_at)
         return _Unplugged()
 

@@ -31,7 +31,9 @@ OVERRUN_S = 1e-3
 """A reply delivered more than this long after it was due counts as a real-time overrun [s]."""
 
 TOO_SLOW_S = 5e-3
-"""If simulation takes longer than the simulated time by more than this twice in a row, the excess is skipped [s]."""
+"""Tolerated excess of computing time over simulated time [s]. If it is exceeded twice in a row, the server skips the
+time beyond it.
+"""
 
 LONGEST_SLEEP_S = 0.05
 """Longest wait before the server checks for faults, watchdog trips and a request to stop [s]."""
@@ -273,7 +275,7 @@ def _baud_of(master: int) -> int:
 
 
 def _wake_up_in_time() -> None:
-    """Ask Linux for microsecond timers and real-time scheduling of the serving thread.
+    """Ask Linux for microsecond timers and real-time scheduling for the server's thread.
 
     Without them, the servos would fall silent for many milliseconds on a busy computer.
     """

@@ -1,4 +1,4 @@
-"""Values that contradict prior knowledge by being many standard deviations from configured or typical values.
+"""Detection of identified values that are many standard deviations from configured or typical ones.
 
 If the model lacks an effect, such as gear backlash, other parameters imitate it. A large deviation from a value known
 beforehand reveals this; standard errors do not.
@@ -35,7 +35,7 @@ _CHECKS = {
     "zero": "check zero_ticks and the horn's position",
     "base_tilt": "check arm.base",
     "encoder": "check the encoder and its magnet",
-    "stribeck_velocity": "use slower motion to separate friction near standstill",
+    "stribeck_velocity": "use slower motion, so that friction near standstill can be determined",
 }
 _DRIVE = "check the joint's servo model and mode"
 _LINK = "correct that link's mass, centre of mass and inertia in the description, or check what the arm carries"
@@ -84,7 +84,7 @@ def conflict(
 ) -> Conflict | None:
     """Return the contradiction between `value` and `expected`; None if there is none.
 
-    relative: `spread` is the standard deviation of the logarithm.
+    relative: whether `spread` is the standard deviation of the logarithm.
     """
     source = source or ("file" if kind_of(name) in _GIVEN else "servos")
     if not (np.isfinite(std) and spread > 0.0):
@@ -103,8 +103,8 @@ def conflicts(
 ) -> tuple[Conflict, ...]:
     """Return the contradictions among the parameters of a planar arm, the largest first.
 
-    torque_scale_std: relative standard deviation of the ratio of torque constants, by parameter, if configured; the
-    default is that of `hil.estimator.models.terms`.
+    torque_scale_std: configured relative standard deviation of the ratio of torque constants, keyed by parameter name;
+    without an entry, the value in `hil.estimator.models.terms` is used.
     """
     found = []
     for name, each, error in zip(names, value.tolist(), std.tolist(), strict=True):
@@ -119,7 +119,7 @@ def conflicts(
 
 
 def worst_first(found: Sequence[Conflict | None]) -> tuple[Conflict, ...]:
-    """Return the contradictions in `found`, the largest first."""
+    """Return the entries of `found` that are not None, the largest contradiction first."""
     return tuple(sorted((each for each in found if each is not None), key=lambda each: -each.deviations))
 
 

@@ -1,10 +1,11 @@
 """Comparison of the mean torque over the last few tenths of a second with the model as it was before that time.
 
 If someone pushes or grips the arm while the model is still being learnt, the model adapts to this, and no residual
-stands out. A model stored earlier is unaffected. Therefore its prediction is compared with the mean torque since it was
-stored, 5, 10 and 20 lessons (updates of the model) or 0.1, 0.2 and 0.4 s ago. Averaging cancels effects that alternate
-with the motion (noise, play, ripple), but not a push. If the joint has hardly moved since, the static friction that may
-have held it is subtracted.
+stands out. A model stored before the disturbance is unaffected. Therefore the models stored 5, 10 and 20 lessons
+(updates of the model) ago, that is, 0.1, 0.2 and 0.4 s ago, are used: the prediction of each of these models is
+compared with the mean torque since it was stored. Averaging cancels effects that alternate with the motion (noise,
+play, ripple), but not a push. If the joint has hardly moved in that time, the static friction that may have held it is
+subtracted.
 
 The terms of a joint's equation, `torque - row theta`, are summed over time, so that the mean between any two stored
 moments requires one subtraction. These functions are part of compiled loops.
@@ -26,7 +27,7 @@ TIMES = 3.5
 
 RELATIVE_STD = 0.1
 """Relative standard deviation of each term of the mean (inertia, gravity, friction). A model that fits one motion is
-not exact in the next: in a fast swing, terms several times as large as the commanded torque cancel.
+not exact in the next: in a fast swing, terms several times as large as the commanded torque cancel each other.
 """
 
 IN_A_ROW = 2

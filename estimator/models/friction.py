@@ -19,7 +19,7 @@ def direction(v: Array, width: float) -> Array:
 
 
 def viscous(values: Values, joint: int, v: Array, step: Array) -> Array:
-    """Return the speed-dependent friction of `joint` (from 1) [N m]; step: the joint's `direction`."""
+    """Return the viscous friction of `joint` (from 1) [N m]; step: result of `direction` for this joint."""
     moving = values.get(f"viscous_{joint}", 0.0) * v
     asymmetry = values.get(f"viscous_asymmetry_{joint}", 0.0)
     return np.asarray(moving + asymmetry * v * step if asymmetry else moving)

@@ -17,8 +17,8 @@ from hil.estimator.models.terms import (
 )
 
 LEVER_STD = 0.05
-"""Relative standard deviation of the ratio of a measured link length to the gravitational acceleration in the plane of
-motion, which depends on the configured tilt.
+"""Relative standard deviation of the quotient of a measured link length and the component of gravity in the plane of
+motion. That component depends on the configured tilt.
 """
 
 
@@ -35,10 +35,10 @@ class Model:
     Options:
         presliding: replaces coulomb_width by bristles that deflect before they slip
             (`hil.estimator.simulation.bristles`).
-        asymmetry: adds viscous_asymmetry |v|, friction that depends on direction (for the Coulomb level, the offset
-            does this).
+        asymmetry: adds viscous_asymmetry |v|, friction that depends on direction (the offset covers a
+            direction-dependent Coulomb level).
         ripple: multiplies the motor torque by 1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q),
-            with ripple_cycles per turn of the joint.
+            where ripple_cycles is the number of cycles per turn of the joint.
         cogging: adds cogging_sin sin(cogging_cycles q) + cogging_cos cos(cogging_cycles q) to the torque.
         zeros: adds zero errors of the encoders, true angle = measured angle + zero; the first joint's is observable
             only under gravity.
@@ -50,7 +50,7 @@ class Model:
             encoder_sin_twice sin 2q + encoder_cos_twice cos 2q.
         lags: adds lag_difference to the lag of the second joint's torque or, without a lag, to its delay.
 
-    Raises ModelError for unknown names, for torque_scale with one joint, and unless there are one or two joints.
+    Raises ModelError for an unknown name, for torque_scale with one joint, and unless the arm has one or two joints.
     """
 
     joints: int

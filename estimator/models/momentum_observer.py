@@ -13,17 +13,17 @@ slowly). The range of admissible motion is therefore wide for a poorly known arm
 
 A joint's residual torque is the part that the motion does not account for. An alarm is raised if it exceeds three
 thresholds for `HOLD_S` (a shorter time if it far exceeds them): `TIMES` standard deviations of the uncertainty due to
-parameters and noise, the torque that friction can hold while the joint stands still, and a fraction of the largest
+parameters and noise, the torque that friction can balance while the joint stands still, and a fraction of the largest
 planned torque. The noise is estimated as well, so that effects that the model lacks (Stribeck friction, backlash,
-flexibility) widen the admissible range. A deviation that could lead to an alarm enters this estimate only after it has
-subsided without one. Otherwise, while a joint was held for a long time, the range would widen until nothing exceeded
-it. While a joint stands still, its noise is lower, since most noise arises only in motion.
+flexibility) widen the admissible range. A deviation that could lead to an alarm is only included in this estimate once
+it has subsided without causing an alarm. Otherwise, if something held a joint for a long time, the range would widen
+until nothing exceeded it. A lower noise is assumed while a joint stands still, since most noise arises only in motion.
 
 Once a joint's angle has stayed within its gear's play for `_STAYS_S`, the reported velocity does not show in which
 direction friction acts: the motor may stick while the link floats from one side of the play to the other. A torque that
 friction in either direction could balance then does not contribute to an alarm.
 
-The torque that friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion,
+The torque that friction can balance includes the viscous friction at the speeds of the usual motion: in a small motion,
 where presliding of the gear softens every reversal, dry friction looks viscous but still holds the joint once it has
 stopped.
 
@@ -106,14 +106,14 @@ _HARDLY_KNOWN = _HIGHEST + 3
 class MomentumObserver:
     """Momentum observer for arms of one or two joints.
 
-    mean: parameters by name, 0 if left out.
+    mean: parameters by name; missing ones are 0.
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
     frictions: multiple of the dry friction in `mean`; thresholds are derived from this torque if it exceeds `largest`,
     since friction near standstill differs from the model.
-    hardly_known: whether only the torque is known beforehand; if so, mean torques are also compared with the earlier
-    model.
+    hardly_known: whether nothing is known of the arm beforehand except the planned torque; if so, mean torques are also
+    compared with the earlier model.
     """
 
     def __init__(
@@ -129,7 +129,8 @@ class MomentumObserver:
         joints = len(largest)
         if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
             raise ValueError(
-                f"{joints} joints and a covariance of shape {covariance.shape}: 1 or 2 joints and (14, 14) are needed"
+                f"{joints} joints and a covariance of shape {covariance.shape}: expected 1 or 2 joints and a shape of "
+                "(14, 14)"
             )
         self._joints = joints
         self._memory = np.zeros((_GAIN + 1, _COUNT))
@@ -148,7 +149,7 @@ class MomentumObserver:
         self._constants = np.concatenate(([joints, interval, *floor], *further))
         self._past = earlier_model.memory(_COUNT)
         self.memory = self._memory, self._rests, self._past, self._constants
-        """Arguments of `observe`, the compiled loop, that precede the sample."""
+        """The first arguments of the compiled loop `observe`; the sample follows them."""
         self.observe(
             (0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf
         )  # compiles the loop and initialises the memory
@@ -175,7 +176,7 @@ class MomentumObserver:
 
 
 def _regressors(momentum: Any, rest: Any, q1: float, q2: float, v1: float, v2: float) -> None:
-    """Compute the rows of both joints, in the order of NAMES."""
+    """Compute both joints' regressor rows; the columns are in the order of NAMES."""
     cos_2, sin_2 = math.cos(q2), math.sin(q2)
     both = v1 + v2
     momentum[0, 0] = v1
@@ -212,7 +213,7 @@ def _begin_anew(m: Any, momentum: Any, rest: Any, t1: float, t2: float) -> None:
 
 
 def _filter(m: Any, j: int, momentum: Any, rest: Any, torque: float, fallen: float, slope: float, row: Any) -> None:
-    """Low-pass filter one joint's signals; compute the regressors of the filtered equation into `row`."""
+    """Low-pass filter one joint's signals; write the regressors of the filtered equation to `row`."""
     single = m[_SINGLE]
     for i in range(_COUNT):
         m[_MOMENTUM + j, i] += fallen * (momentum[j, i] - m[_MOMENTUM + j, i])
@@ -242,7 +243,7 @@ def _gain(m: Any, i: int, row: Any) -> float:
 
 
 def _learn(m: Any, row: Any, gain: Any, lacking: float, spread: float, first: int) -> None:
-    """Update the parameters from `first` on, allowing for the uncertainty of the others (Schmidt-Kalman filter)."""
+    """Update the parameters from index `first` on, with the others' uncertainty considered (Schmidt-Kalman filter)."""
     for i in range(_COUNT):
         gain[i] = _gain(m, i, row)
     for i in range(_COUNT):
@@ -263,7 +264,7 @@ def _keep_dissipative(m: Any) -> None:
 
 
 def _static_friction(m: Any, rest: Any, j: int) -> float:
-    """Return the largest torque that friction may hold at standstill [N m]."""
+    """Return the largest torque that friction may balance at standstill [N m]."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
     viscous = m[_THETA, 6 + j] - math.sqrt(max(m[_COVARIANCE + 6 + j, 6 + j], 0.0))
     peak = math.sqrt(2.0 * m[_PENDING, _SQUARED + j])  # velocity of a sine
@@ -282,7 +283,7 @@ def _is_blocked(
     rounding: float,
     dt: float,
 ) -> bool:
-    """Return whether joint j stands still although its torque has varied by more than friction can hold.
+    """Return whether joint j stands still although its torque has varied by more than friction can balance.
 
     distance: result of `standstill.look`. held: torque that certainly acts on the joint now. floor: smallest tolerance.
     noise, rounding: variances of one sample's residual torque at standstill. All in SI units.
@@ -336,7 +337,7 @@ def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
 
 
 def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> None:
-    """Update the noise variance; contributions during a possible alarm are deferred until it has ended."""
+    """Update the noise variance; while an alarm is possible, contributions are deferred."""
     for_later = m[_PENDING]
     if pending:
         for_later[_TAUGHT + j] += taught * dt
@@ -351,7 +352,7 @@ def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> Non
 
 
 def _stays(m: Any, j: int, angle: float, velocity: float, dt: float) -> bool:
-    """Process a sample; return whether the joint moves but has for some time stayed within its gear's play."""
+    """Process a sample; return whether the joint moves but has stayed within its gear's play for some time."""
     if abs(angle - m[_PENDING, _ANGLE + j]) > _PLAY_RAD:
         m[_PENDING, _ANGLE + j], m[_PENDING, _STAYS + j] = angle, 0.0
         return False
@@ -360,7 +361,7 @@ def _stays(m: Any, j: int, angle: float, velocity: float, dt: float) -> bool:
 
 
 def _beyond_either(m: Any, j: int, row: Any, lacking: float, static: float) -> float:
-    """Return by how much a residual torque exceeds static friction, in whichever direction this acts [N m]."""
+    """Return the excess of a residual torque over static friction [N m], whichever way friction acts."""
     return float(max(abs(lacking + row[8 + j] * m[_THETA, 8 + j]) - static, 0.0))
 
 
@@ -387,7 +388,7 @@ def _accelerates(m: Any, j: int, slope: float) -> bool:
 
 
 def _floor(m: Any, k: Any, j: int) -> float:
-    """Return the smallest torque that can raise an alarm; it is lower if the joint's friction turns out to be small."""
+    """Return the smallest torque that can raise an alarm, which is lower for joints with little friction."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
     return float(max(k[2 + j], min(k[_HIGHEST + j], k[_HIGHEST + 2] * dry)))
 

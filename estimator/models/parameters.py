@@ -14,7 +14,7 @@ CONSTANTS = constants()
 ABSENT = {name: term_of(name).absent for name in CONSTANTS}
 """Values that disable terms missing from the model; a one-joint arm gets a second joint that moves freely."""
 ENCODER = tuple(name for name, term in TERMS.items() if term.part == "encoder")
-"""Terms of the encoder errors that are periodic over a turn."""
+"""Terms that describe encoder errors periodic over a turn."""
 LEAST_LAG = 1e-6  # s
 SLIDING = 0.05  # rad/s: velocity above which a joint slides, with its bristles deflected in that direction
 
@@ -32,7 +32,7 @@ def place_of(term: str) -> int:
 
 VISCOUS, GENERATED = place_of("viscous"), place_of("back_emf")
 OWN_INERTIA = CONSTANTS.index("inertia_1"), CONSTANTS.index("armature_2")
-"""Indices of the constants that include each joint's own inertia, such as that of its rotor."""
+"""For each joint, the index of the constant that contains the joint's own inertia, including its rotor's."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class Physics:
     encoder: Array = field(default_factory=lambda: np.zeros((2, len(ENCODER))))
     """Encoder errors by joint, in the order of ENCODER (2, terms) [rad]."""
     lag_difference: float = 0.0
-    """Lag of the second joint's torque minus that of the first joint's [s]; without a lag, difference in delay."""
+    """Lag of joint 2's torque minus lag of joint 1's torque [s]; without a lag, the difference in delay."""
 
     @classmethod
     def of(cls, parameters: Mapping[str, float]) -> "Physics":
         """Return the constants for parameters given by name; all other terms are disabled.
 
-        Friction with presliding has no velocity step; code that needs a width uses SLIDING.
+        With presliding, friction has no Coulomb step; code that needs the step's width uses SLIDING.
         """
         parameters = dict(parameters)
         parameters |= {
@@ -91,7 +91,7 @@ class Physics:
         return late
 
     def crossing_times(self) -> tuple[float, float]:
-        """Return the time [s] that a friction reversal takes to cross each joint's Coulomb step or deflect its
+        """Return the time [s] in which a reversal of friction takes each joint across its Coulomb step, or deflects its
         bristles.
         """
         constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))

@@ -174,7 +174,7 @@ def _slope(function: object, x: Array, size: Array) -> Array:
 
 
 def _null_space(slope: Array) -> Array:
-    """Return the directions in which nothing changes (unknowns, directions)."""
+    """Return a basis of the null space of `slope` (unknowns, directions)."""
     _, size, Vt = linalg.svd(slope)
     rank = int(np.sum(size > SINGULAR * size[0]))
     null: Array = Vt[rank:].T
@@ -218,6 +218,6 @@ def _doubts(
     if misfit > CONTRADICTION:
         doubts.append(
             f"the known quantities ({', '.join(known)}) and the data contradict each other by {misfit:.0f} standard "
-            "errors: measure again, or give each a std"
+            "errors: measure them again, or specify a std for each"
         )
     return tuple(doubts)

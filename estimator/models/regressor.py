@@ -26,8 +26,8 @@ def regressor(position: Array, velocity: Array, acceleration: Array, coulomb_wid
         position: angles (joints, samples) [rad].
         velocity: velocities (joints, samples) [rad/s].
         acceleration: accelerations (joints, samples) [rad/s^2].
-        coulomb_width: width of the smoothed sign of velocity, tanh(velocity / coulomb_width) [rad/s], one value or one
-            per joint; 0 for the sharp sign.
+        coulomb_width: width of the smoothed sign of velocity, tanh(velocity / coulomb_width) [rad/s], one value for
+            all joints or one per joint; 0 for the exact sign.
 
     Raises:
         ShapeError: if the three arrays differ in shape.

@@ -7,9 +7,9 @@ offset cancel in these differences, and so do their errors. Only changes due to 
 modelled.
 
 A torque outside the band accelerates a free joint. The joint counts as blocked once the motion of a free joint would
-show in the velocity register. Twice the momentum of that motion is required, because only half of the excess is certain
-to act on the joint as long as the position of the band is unknown. If a joint does move again, friction had been
-holding it, and no torque that it withstood will raise an alarm again.
+show in the velocity register. Twice the momentum of that motion is required, because as long as the position of the
+band is unknown, only half of the excess is certain to act on the joint. If a joint moves again, it had been held by
+friction; a torque range that it has withstood in this way never raises an alarm again.
 
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """
@@ -26,7 +26,8 @@ WITHIN_RAD = 0.004
 """Largest change in the angle of a joint at rest [rad], including encoder noise and gear play."""
 
 AT_REST = 0.95
-"""Filtered standstill indicator above which a joint counts as at rest; by then, the filtered deceleration has decayed.
+"""Value of the filtered standstill indicator above which a joint counts as at rest. When this value is reached, the
+filtered deceleration has decayed.
 """
 
 HOLD_S = 0.03
@@ -50,7 +51,7 @@ def withstood(rest: Any) -> float:
 
 
 def is_suspect(rest: Any) -> bool:
-    """Return whether the torque is, or was just before, outside the band that friction can hold."""
+    """Return whether the torque is outside the band that friction can balance, or was so until just now."""
     return bool(rest[_UP] > 0.0 or rest[_DOWN] > 0.0)
 
 
@@ -60,11 +61,10 @@ def forget(rest: Any) -> None:
 
 
 def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta: Any) -> float:
-    """Process a sample; return the distance of its residual torque from the most distant one since the joint came to
-    rest.
+    """Process a sample; return the largest difference between its residual torque and any since the joint came to rest.
 
-    The residual torque is `torque - row theta`. The distance [N m] is positive if the smallest residual is the most
-    distant one, negative if the largest is, and 0 while the joint moves.
+    The residual torque is `torque - row theta`. The difference [N m] is to the smallest or the largest residual so far,
+    whichever is further away: positive to the smallest, negative to the largest. It is 0 while the joint moves.
 
     rest: one joint's row of `memory`. stands: filtered indicator of standstill, 0 to 1. torque, row: equation of the
     joint at this sample [N m]. theta: parameters.
@@ -103,7 +103,7 @@ def keep(rest: Any, first: int, row: Any) -> None:
 
 
 def variance(rest: Any, distance: float, row: Any, covariance: Any) -> float:
-    """Return the variance, due to the parameters' covariance, of the distance that `look` returned [N^2 m^2]."""
+    """Return the variance of the result of `look` that is due to the parameters' covariance [N^2 m^2]."""
     count = row.size
     other = rest[_SINGLES : _SINGLES + count] if distance > 0.0 else rest[_SINGLES + count :]
     total = 0.0
@@ -128,7 +128,7 @@ def blocked(
     """Return whether something other than friction holds the joint.
 
     distance: result of `look` [N m]. held: torque that certainly acts on the joint now, in one direction. friction:
-    largest torque in one direction that dry friction may hold [N m]. tolerance: tolerance of the distance [N m].
+    largest torque in one direction that dry friction may balance [N m]. tolerance: tolerance of the distance [N m].
     momentum: momentum of the joint at the smallest visible velocity [N m s]. filter_s: time constant of the equation's
     filter [s]. dt: time since the previous sample [s].
     """

@@ -2,8 +2,8 @@
 
 Fits, results, reports, exports and the configuration take names, units, descriptions, ranges, initial guesses and
 scales from here; docs/architecture.md lists the files to change for a new term. Parameters are named `term_joint`, with
-joints counted from 1, and those of the whole arm are named just `term`. This module imports only the standard library,
-so that reading a result is fast.
+joints counted from 1, while a parameter of the whole arm is named just `term`. This module imports only the standard
+library, so that reading a result is fast.
 """
 
 import re
@@ -53,7 +53,7 @@ Range = Literal["any", "positive", "floor", "share"]
 Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation", "cable", "cogging"]
 
 FRICTIONS: tuple[Friction, ...] = get_args(Friction)
-"""Laws of dry friction; each includes the terms of the previous ones."""
+"""Laws of dry friction; each one also includes the terms of all previous laws."""
 DRIVES: dict[Drive, tuple[str, ...]] = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
 """Terms of each drive model."""
 OPTIONS: dict[Option, str] = {
@@ -70,8 +70,8 @@ OPTIONS: dict[Option, str] = {
 }
 """Optional parts of a model and their descriptions; also keys of `[model]`."""
 BEYOND_SPEEDS = 3.0
-"""Stribeck velocity, as a multiple of a joint's highest speed, at which the Stribeck rise of friction decreases by no
-more than a tenth over the speeds of the recording.
+"""Stribeck velocity, as a multiple of a joint's highest speed, for which the Stribeck rise falls by at most a tenth
+within the recorded range of speeds.
 """
 
 
@@ -87,12 +87,12 @@ class Term:
     """Description for users."""
     _: KW_ONLY
     part: str
-    """The part of a model that includes this term: "base" (part of the linear regression, always present), a law of
-    FRICTIONS, one of OPTIONS, a drive's term, or "voltage" (joints driven by voltage).
+    """The part of a model that includes this term: "base" (part of the linear regression, always present), one of
+    FRICTIONS, one of OPTIONS, "delay" or "lag" (as listed in DRIVES), or "voltage" (joints driven by voltage).
     """
     scope: Scope = "joint"
     first_joint: int = 1
-    """First joint with this term: 2 if the term is relative to joint 1, or if joint 1's is part of another term."""
+    """First joint with this term: 2 if the term is relative to joint 1, or if another term includes it for joint 1."""
     range: Range = "positive"
     """Range of values.
 
@@ -100,10 +100,11 @@ class Term:
     either sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of the two terms whose geometric mean bounds this one, both of the same joint if each joint has this term.
+    """Names of the two terms whose geometric mean bounds this term. If this is a term of each joint, both belong to the
+    same joint.
     """
     scale: Scale | float = 1.0
-    """Typical change in the fit: the name of a scale of the arm and its motion, or a number [unit]."""
+    """Typical change during a fit: a number [unit], or the name of a scale that depends on the arm and its motion."""
     initial: float = 0.0
     """Initial guess if neither the regression nor the caller provides one [unit]."""
     absent: float = 0.0
@@ -125,7 +126,7 @@ class Term:
     simulated: bool = True
     """Whether the term belongs to the equations of motion rather than to the drive or the encoders."""
     spread: Scale | float | None = None
-    """Typical deviation from its `absent` value among real arms, as a scale or a number [unit]; None if unknown."""
+    """Typical deviation from `absent` on real arms: a number [unit] or the name of a scale; None if unknown."""
     log_spread: float | None = None
     """Standard deviation of a positive term's logarithm about the logarithm of `initial`; None if unknown."""
 
@@ -139,7 +140,7 @@ _DECLARED = (
     Term(
         "inertia",
         "kg m^2",
-        "inertia of the joint's link about the joint; for joint 1, including its rotor and the mass at its end",
+        "inertia of the joint's link about the joint; for joint 1, including its rotor and the mass at the link's end",
         part="base",
         scale="inertia",
     ),
@@ -346,7 +347,7 @@ def joint_of(name: str) -> int | None:
 
 
 def base_names(joints: int) -> tuple[str, ...]:
-    """Return the names of the base parameters, in the order of every vector of them; raises ModelError."""
+    """Return the names of the base parameters, in the order that all vectors of them use; raises ModelError."""
     if joints not in RIGID_BODY:
         raise ModelError(f"an arm of {joints} joints: the planar arm model supports one or two")
     friction = (f"{term}_{joint + 1}" for term in BASE_FRICTION for joint in range(joints))
@@ -356,7 +357,7 @@ def base_names(joints: int) -> tuple[str, ...]:
 def extra_names(
     joints: int, parts: frozenset[str] | None = None, by_voltage: frozenset[int] | None = None
 ) -> tuple[str, ...]:
-    """Return the names of the other parameters of a model with these `parts`; by default of all parts.
+    """Return the names of a model's parameters except the base parameters; parts: its parts, by default all.
 
     by_voltage: joints (from 1) that are driven by voltage; by default all.
     """
@@ -370,7 +371,7 @@ def extra_names(
 
 
 def constants() -> tuple[str, ...]:
-    """Return the names of the constants in the equations of motion of two joints, term by term for joints 1 and 2."""
+    """Return the names of the constants in a two-joint arm's equations of motion, ordered by term, then by joint."""
     joints = (1, 2)
     simulated = [term for term in _DECLARED if term.simulated and term.part != "base"]
     per_joint = [*BASE_FRICTION, *(term.name for term in simulated if term.scope == "joint")]

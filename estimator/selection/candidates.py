@@ -1,4 +1,4 @@
-"""Evaluation of missing model terms without fits: score tests, and the effect of their omission on standard errors.
+"""Evaluation of omitted model terms without fits: score tests, and the effect of the omission on the standard errors.
 
 Near an estimate the motion is linear in small changes of any parameter. One simulation with derivatives with respect to
 all of them yields the decrease in the sum of squares that each term would bring (C. R. Rao's score test, Proc.
@@ -37,7 +37,7 @@ SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model with one term more than the estimate's, and the term's score test."""
+    """A model with one more term than the estimate's model, and that term's score test."""
 
     model: Model
     part: str
@@ -56,7 +56,7 @@ class Candidate:
 class Linearised:
     """Quadratic approximation of the weighted sum of squares near an estimate.
 
-    The unknowns, to which the shapes refer, are the parameters, followed by the initial state.
+    The unknowns (as in the shapes below) are the parameters, followed by the initial state.
     """
 
     names: tuple[str, ...]
@@ -66,7 +66,7 @@ class Linearised:
     normal: Array
     """J'WJ (unknowns, unknowns)."""
     gradient: Array
-    """J'Wr with r simulated minus measured (unknowns,)."""
+    """J'Wr (unknowns,), where r is simulated minus measured position."""
     samples: int
     """Number of valid samples over all joints. Each joint's residual is divided by its RMS, so the sum of squares
     equals this number.
@@ -118,8 +118,8 @@ def linearised(
 ) -> Linearised:
     """Expand the sum of squares of `period` about `estimate`, which was fitted to it.
 
-    `names`: additional parameters, expanded about their value in `known` or, without one, about the value at which they
-    have no effect.
+    `names`: additional parameters. Each is expanded about its value in `known` or, if it is missing there, about the
+    value at which it has no effect.
     """
     used = without_spikes(period)
     added = [name for name in names if name not in estimate.names]
@@ -154,8 +154,8 @@ def linearised(
 def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, float]) -> list[Candidate]:
     """Return the terms that could be added to the estimate's model, most significant first.
 
-    `known`: the periods of ripple and cogging (`hil.estimator.selection.waves`), by parameter name; a wave whose period
-    is not given is not considered.
+    `known`: the periods of ripple and cogging (`hil.estimator.selection.waves`), by parameter name; ripple or cogging
+    without a given period is not considered.
     """
     model = estimate.model
     richer = richer_models(model)
@@ -212,7 +212,9 @@ def unruled(model: Model) -> list[str]:
 
 
 def widened(about: Linearised, names: Sequence[str], covariance: Array, left_out: Sequence[str]) -> Array:
-    """Return the covariance of the fitted parameters `names`, including the uncertainty of those `left_out`."""
+    """Return the covariance of the fitted parameters `names`, including the effect of the uncertain parameters
+    `left_out`.
+    """
     fitted = [*about.places(names), *about.states]
     extra = about.places(left_out)
     scale = np.sqrt(np.maximum(np.diag(about.normal), 1e-300))

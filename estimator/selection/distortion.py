@@ -1,11 +1,12 @@
-"""Noise, nonlinear distortion and model error, separated by the lines on which they appear.
+"""Noise, nonlinear distortion and model error, separated by the Fourier lines on which they appear.
 
-The method is that of Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. An arm that is excited
-only on odd lines responds on these and, being nonlinear, on others as well. Effects that change sign with the motion
-(friction, gravity about a hanging pose) appear on odd lines; others (an offset, direction-dependent friction, gravity
-about any other pose) appear on even lines. Some odd lines, the detection lines, are left unexcited. If even lines are
-excited too, odd distortion appears on all lines, so the unexcited lines cannot be separated into odd and even and form
-a single group. On each group of lines, the part of a fit's residual that exceeds the noise is the model error.
+The method is that of Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. Line k is the
+component of a signal with k cycles per period. An arm that is excited only on odd lines responds on these lines and,
+since it is nonlinear, on others as well. Effects that change sign with the motion (friction, gravity about a hanging
+pose) appear on odd lines; others (an offset, direction-dependent friction, gravity about any other pose) appear on even
+lines. Some odd lines, the detection lines, are left unexcited. If even lines are excited too, odd distortion appears on
+all lines, so the unexcited lines cannot be separated into odd and even and form a single group. On each group of lines,
+the part of a fit's residual that exceeds the noise is the model error.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ EXCITED = 1e-4  # fraction of the strongest line's power; the rounding of a comm
 
 @dataclass(frozen=True)
 class LineGroup:
-    """A group of Fourier lines, such as all excited or all even ones."""
+    """A group of Fourier lines, such as all excited lines or all even lines."""
 
     lines: int
     """Number of lines."""
@@ -34,12 +35,12 @@ class LineGroup:
 
 @dataclass(frozen=True)
 class Distortion:
-    """RMS per line for each group of lines, in encoder steps (joints,)."""
+    """RMS per line (joints,) [encoder steps] for each group of Fourier lines."""
 
     noise: Array
-    """Noise per line, from the scatter between periods or from the highest lines, whichever is larger."""
+    """Noise per line: the larger of two estimates, from the scatter between periods and from the highest lines."""
     excited: LineGroup
-    """Lines on which some joint was excited."""
+    """The Fourier lines on which at least one joint was excited."""
     odd: LineGroup | None
     """Unexcited odd lines up to the highest excited one; None unless all excited lines are odd."""
     even: LineGroup | None
@@ -49,7 +50,7 @@ class Distortion:
 
 
 def excited_lines(period: SettledPeriod) -> Mask:
-    """Return whether any joint was excited at each harmonic, starting with 0 (lines,)."""
+    """Return, for each Fourier line from line 0 on, whether any joint was excited on it (lines,)."""
     drive = period.torque if period.stabiliser is None else period.stabiliser.excitation
     power = np.abs(lines_of(drive)) ** 2
     power[:, 0] = 0.0

@@ -138,7 +138,7 @@ def torque_change(period: SettledPeriod, estimate: Estimate) -> TorqueChange:
 def _fitted(later: "_Later", period: SettledPeriod, most: float | Array) -> tuple[Array, Array, float]:
     """Return the change (joints,), its standard error and the remaining sum of squares.
 
-    most: largest change in one iteration.
+    most: largest permitted change in one iteration.
     """
     joints = period.joints
     change, state = np.zeros(joints), _first_state(period)
@@ -215,7 +215,7 @@ def _is_finite(A: Array, r: Array) -> bool:
 
 
 def _first_state(period: SettledPeriod) -> Array:
-    """Return angles and velocities at the first sample (2, joints), from the lines of the motion."""
+    """Return angles and velocities at the first sample (2, joints), computed from the motion's Fourier lines."""
     lines = lines_of(period.filled())
     motion = motion_of(lines, cut_off(lines), period.fundamental, period.samples)
     return np.stack((motion.position[:, 0], motion.velocity[:, 0]))

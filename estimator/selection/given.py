@@ -58,7 +58,8 @@ def _with_wave(
     starts: Sequence[Mapping[str, float]],
     options: SelectionOptions,
 ) -> Estimate:
-    """Return the best fit of the estimate's model with `wave` added, from the most likely numbers of cycles.
+    """Return the best fit of the estimate's model with `wave` added, starting from the most likely numbers of cycles
+    per turn.
 
     A wave is most visible in the residual of the fit that explains the most, even if its terms partly imitate the wave;
     that fit is used only for the search.

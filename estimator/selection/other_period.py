@@ -19,7 +19,7 @@ def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
     contain the end of a transient, and then uses only the torque. If the earlier state is not known, the arm is
     simulated from rest until its motion repeats.
 
-    Raises PeriodicityError if it never does.
+    Raises PeriodicityError if it never repeats.
     """
     if other.before is not None:
         return _from_before(Physics.of(estimate.parameters), other, other.before)
@@ -32,7 +32,7 @@ def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
 
 
 def _from_before(physics: Physics, other: SettledPeriod, before: Array) -> Array:
-    """Return the mean of the simulated periods after the one that begins in the state `before` (2, joints)."""
+    """Return the mean of all simulated periods but the first, which starts in the state `before` (2, joints)."""
     start = np.stack((without_errors(physics, before[0][:, None])[:, 0], before[1]))
     periods = (
         _free(physics, other, start) if other.stabiliser is None else _held(physics, other, other.stabiliser, start)

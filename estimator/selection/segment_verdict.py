@@ -170,7 +170,7 @@ def _predicted(held_out: Array | None, length: float) -> str:
     if held_out is None:
         return "The model was not validated on a held-out motion: the recording is too short to hold out part of it."
     return (
-        f"Fitted to every other segment of {length:g} s, the model predicts the remaining ones to within "
+        f"When fitted to only half of the {length:g} s segments, the model predicts the other half to within "
         f"{percent(float(held_out.max()))} of the motion's RMS."
     )
 

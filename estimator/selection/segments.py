@@ -39,10 +39,12 @@ def considered(recordings: Sequence[Recording], estimate: ShootingEstimate) -> S
 
 
 def linearised(recordings: Sequence[Recording], estimate: ShootingEstimate, names: Sequence[str]) -> Linearised:
-    """Return the quadratic approximation of the weighted sum of squares about `estimate`, in parameters and zeros.
+    """Return the quadratic approximation of the weighted sum of squares about `estimate`.
 
-    The initial states of the segments are eliminated. names: additional parameters, expanded about the values at which
-    they have no effect.
+    Its variables are the parameters and the encoder zeros of each recording.
+
+    The segments' initial states are eliminated. names: additional parameters, expanded about the values at which they
+    have no effect.
     """
     problem = _posed(recordings, estimate)
     every = (*estimate.names, *(name for name in names if name not in estimate.names))
@@ -85,8 +87,8 @@ def held_out_errors(
     error.
 
     The initial state of a segment is estimated from its first third; the rest is predicted from the torque alone. The
-    median, which is over all joints, is robust to the huge errors of a tumbling arm. A prediction that diverges counts
-    as an error of half a turn.
+    median over the segments is robust to the huge errors of a tumbling arm. A prediction that diverges counts as an
+    error of half a turn.
     """
     problem = _posed(recordings, estimate, of)
     values, joints = estimate.parameters, estimate.model.joints

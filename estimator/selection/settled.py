@@ -1,9 +1,9 @@
 """Friction model selection: fits models from simple to rich and evaluates them on a held-out motion.
 
-If a richer model predicts another motion better in open loop, its additional terms are real, or the improvement is due
-to chance. Therefore it must also reduce the residual by more than meaningless terms would. Without another motion, the
-Bayesian information criterion is used (Schwarz, Annals of Statistics 6 (1978) 461), with the number of samples reduced
-according to the residual's correlation.
+If a richer model predicts another motion better in open loop, either its additional terms are real, or the improvement
+is due to chance. Therefore it must also reduce the residual by more than meaningless terms would. Without another
+motion, the Bayesian information criterion is used (Schwarz, Annals of Statistics 6 (1978) 461), with the number of
+samples reduced according to the residual's correlation.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -226,7 +226,7 @@ class Selection:
         return trial
 
     def _use(self, periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, drift: Drift | None) -> None:
-        """Fit these periods from now on; discard the trials and pending fits of the former ones."""
+        """Fit these periods from now on; discard the trials and pending fits of the previous periods."""
         self._periods = list(periods)
         self._fitting = replace(self._fitting, periods=self._periods, held_out=held_out, drift=drift)
         self.trials = []
@@ -289,7 +289,7 @@ class Selection:
         return self._try_or_none(trial.model, trial) or trial
 
     def _restarted(self, best: Trial) -> Trial:
-        """Refit the model from other initial guesses while it does not explain the motion of every joint."""
+        """Refit the model from other initial guesses until every joint's motion is explained or no guess remains."""
         left, improved = self._options.max_restarts, True
         while improved and best.estimate is not None:
             improved = False
@@ -336,8 +336,8 @@ class Selection:
         return best
 
     def _pruned_by_fits(self, best: Trial) -> Trial:
-        """Remove terms one by one, testing each by a fit without it, since the motion is too sensitive for standard
-        errors.
+        """Remove terms one by one, testing each by a fit without it: the motion is too sensitive for a test based on
+        standard errors.
         """
         for part, plainer in removable_parts(best.model):
             trial = None if part == self._fixed else self._try_or_none(plainer, best)

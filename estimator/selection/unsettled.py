@@ -5,8 +5,8 @@ the motion, or if score tests find a significant term, all other smooth terms ar
 sizes as a prior; then insignificant terms are removed.
 
 If the motion is explained down to the noise, the likelihood decides. Otherwise, since a richer model may merely
-compensate for another missing term, every other segment of each recording is fitted and the rest are predicted; models
-with presliding friction are tried as well.
+compensate for another missing term, the model is fitted to alternate segments of each recording and predicts the rest;
+models with presliding friction are tried as well.
 """
 
 import time
@@ -51,7 +51,7 @@ class SegmentTrial:
 
 @dataclass(frozen=True)
 class SegmentChoice:
-    """The models tried, in order, the chosen one, and its fit to all segments."""
+    """The models tried, in order, with the chosen model and its fit to all segments."""
 
     trials: tuple[SegmentTrial, ...]
     chosen: SegmentTrial
@@ -103,7 +103,7 @@ def choose_by_shooting(
 
 
 def held_out_error(recordings: Sequence[Recording], estimate: ShootingEstimate, start: Array) -> Array | None:
-    """Fit the estimate's model to every other segment and return its prediction error on the remaining ones (joints,).
+    """Fit the estimate's model to alternate segments and return its prediction error on the others (joints,).
 
     The error is the RMS error relative to the motion's RMS. Returns None if the fit does not converge or no recording
     has two segments. start: initial guess as in `estimate_by_shooting`.

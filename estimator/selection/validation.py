@@ -1,4 +1,4 @@
-"""Checks of an estimate: residual relative to noise, whiteness, conditioning, open-loop simulation, Fourier lines."""
+"""Checks of an estimate: residual relative to noise, whiteness, conditioning, open-loop simulation, spectrum."""
 
 from dataclasses import dataclass
 
@@ -24,17 +24,17 @@ class Levels:
     """RMS by source, in encoder steps (joints,)."""
 
     excited: Array
-    """Motion on the lines excited in one or more joints."""
+    """Motion on the Fourier lines on which at least one joint was excited."""
     distortion: Array
-    """Motion on the other lines, caused by the arm's nonlinearity."""
+    """Motion on the other Fourier lines, caused by the arm's nonlinearity."""
     noise: Array
-    """Noise of a sample, as measured (`SettledPeriod.noise`)."""
+    """Measured noise of one sample (`SettledPeriod.noise`)."""
     scatter: Array
-    """Noise of a sample of the mean period, from the scatter between periods; 0 if there was only one."""
+    """Noise of one sample of the mean period, from the scatter between periods; 0 for a single period."""
     model_error: Array
     """Residual of the fit beyond rounding and scatter."""
     lines: Distortion
-    """Levels per line, with odd and even lines separated if the excitation allows it."""
+    """Levels per Fourier line, separately for odd and even lines if the excitation allows it."""
 
 
 @dataclass(frozen=True)

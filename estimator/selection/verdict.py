@@ -38,8 +38,10 @@ IMPROVEMENT = {
     "viscous": "higher speeds: raise {torque}",
     "coulomb": "more slow reversals: reduce the lower edge of experiment.band, or lengthen the period",
 }
-ODD_HINT = "Its residual on odd lines indicates friction or ripple that the model lacks."
-EVEN_HINT = "Its residual on even lines indicates an effect that depends on direction, or an offset in torque or angle."
+ODD_HINT = "Its residual at odd harmonics indicates friction or ripple that the model lacks."
+EVEN_HINT = (
+    "Its residual at even harmonics indicates an effect that depends on direction, or an offset in torque or angle."
+)
 BEYOND_NOISE = 2.0
 
 
@@ -206,7 +208,7 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
 
 
 def _distorted(validation: Validation) -> tuple[str, ...]:
-    """Return sentences about the response on unexcited lines and the part of it that the model does not explain."""
+    """Return sentences about the response at unexcited harmonics and the part of it that the model does not explain."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
         return (
@@ -220,8 +222,8 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
         return percent(float(level[joint] / driven[joint]))
 
     found = (
-        f"Joint {joint + 1} also responds on lines that were not excited. Relative to an excited line's motion: "
-        f"{share(levels.odd.motion)} on odd lines (friction, gravity), {share(levels.even.motion)} on even lines "
+        f"Joint {joint + 1} also moves at harmonics that were not excited. Relative to its motion at an excited one: "
+        f"{share(levels.odd.motion)} at odd harmonics (friction, gravity), {share(levels.even.motion)} at even ones "
         f"(offsets, direction-dependent effects), and {share(levels.noise)} noise. The model leaves "
         f"{share(levels.odd.left)} (odd) and {share(levels.even.left)} (even) unexplained."
     )
@@ -265,7 +267,7 @@ def _reason(change: float, seconds: float) -> str:
     """
     holds = "the identified values hold for the fitted periods"
     if change < 0.0:
-        warm = f"To obtain the warm arm's values, set experiment.warm_up = {_warm_up(seconds)}."
+        warm = f"To obtain values for the warm arm, set experiment.warm_up = {_warm_up(seconds)}."
         return f", as is typical while grease warms up: {holds}. {warm}"
     return (
         f", which warming up does not explain: {holds}. Look for a cable or part that has started to "
@@ -334,8 +336,8 @@ def _alike(validation: Validation) -> tuple[str, ...]:
     if abs(correlation) < ALIKE or both <= WELL_KNOWN:
         return ()
     return (
-        f"{first} and {second} are hard to separate (correlation {correlation:.3f}): excite more lines or "
-        "use more torque.",
+        f"{first} and {second} are hard to separate (correlation {correlation:.3f}): excite more "
+        "frequencies or use more torque.",
     )
 
 

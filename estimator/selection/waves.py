@@ -31,7 +31,8 @@ def wave_peaks(
 
     Whatever the fitted parameters can explain is first removed from the residual and the waves. The result is keyed by
     parameter name. If other terms have absorbed part of a wave, the best number may be wrong. Therefore other numbers
-    are returned as well if they explain at least `COMPARABLE` times as much of the sum of squares as the best one.
+    are returned as well if what they explain of the sum of squares is at least the fraction `COMPARABLE` of what the
+    best number explains.
 
     only: joints (from 1) to consider; by default all.
     """

@@ -104,8 +104,8 @@ def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> NDA
     """Return the number of substeps, at most `most`, for a step of `step` [s] while each joint is near standstill.
 
     Within one substep, a reversal of dry friction may take a joint through a quarter of its Coulomb step's width. The
-    numbers are powers of two, so that small changes in the physics seldom change them and hence the last digits of the
-    motion.
+    numbers are powers of two, so that small changes in the physics seldom change them. A changed number would alter the
+    last digits of the motion.
     """
     needed = [min(4.0 * step / max(time, 1e-12), most) for time in physics.crossing_times()]
     return np.array([2 ** math.ceil(math.log2(max(each, 1.0))) for each in needed], dtype=np.int64)

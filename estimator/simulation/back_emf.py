@@ -10,8 +10,8 @@ This is exact for a joint of inertia J, which moves as if its inertia were small
 subtracts back_emf viscous (lag + delay) from the joint's own inertia: 5 to 10 % of it on an XL430. The estimated lag is
 lag', slightly larger than that of the winding.
 
-If the voltage is later than the back-EMF by d, because a goal waits for the servo's control loop, the estimated inertia
-is too large by b d, whatever the lag.
+If the voltage is delayed by d relative to the back-EMF, because a goal waits for the servo's control loop, the
+estimated inertia is too large by b d, whatever the lag.
 
 Ripple, saturation and load-dependent friction act on the motor's torque, which is the torque of the voltage minus the
 torque of the back-EMF (`hil.estimator.simulation.arm`).
@@ -33,7 +33,7 @@ _LATE: dict[str, tuple[int, ...]] = {"lag": (0, 1), "delay": (0, 1), "lag_differ
 
 
 def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the constants for which the simulation must provide derivatives to obtain those for `names`."""
+    """Return the constants by which the simulation must differentiate to obtain the derivatives for `names`."""
     through = [
         CONSTANTS[place]
         for joint in _generating(physics)
@@ -44,10 +44,11 @@ def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Array:
-    """Return derivatives (joints, samples, causes) with respect to the parameters `names`, then the remaining causes.
+    """Return derivatives (joints, samples, causes) with respect to the parameters `names`, then all other causes.
 
-    They are computed from `derivative`, the simulation's derivatives with respect to what `causes_of` returns and the
-    same remaining causes. In the simulation, viscous friction, back-EMF and the joint's inertia are separate constants.
+    derivative: the simulation's derivatives with respect to the constants that `causes_of` returns, then the same other
+    causes (the initial state, for example). In the simulation, viscous friction, back-EMF and the joint's inertia are
+    separate constants.
     """
     joints = _generating(physics)
     if not joints:
@@ -76,10 +77,10 @@ def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Arr
 def neglected_inertia(brake: float, lost: float, inertia: float, delay: float) -> float:
     """Return the standard deviation of a joint's inertia due to effects that this model neglects [kg m^2].
 
-    The effect of friction on the motor's current is late by lag' - lag. On most arms this is negligible, but it amounts
-    to 5 % of the inertia of an XL430 with hardly any load. The voltage's delay d contributes 1 to 2 %.
+    The effect of friction on the motor's current is delayed by lag' - lag. On most arms this is negligible, but it
+    amounts to 5 % of the inertia of an XL430 with hardly any load. The delay d of the voltage contributes 1 to 2 %.
 
-    brake: b [N m s/rad]. lost: b lag' [kg m^2]. delay: pure delay [s], which may be of the voltage alone.
+    brake: b [N m s/rad]. lost: b lag' [kg m^2]. delay: pure delay [s]; part or all of it may affect only the voltage.
     """
     return math.hypot(lost**2 / inertia, brake * max(UNKNOWN_DELAY, 0.5 * delay))
 

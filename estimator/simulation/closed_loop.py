@@ -102,7 +102,7 @@ class Stabilised:
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
-    """Add the delay to the lag and subtract the `command_to_sample` [s] by which commands act earlier."""
+    """Add the delay to the lag, minus the time `command_to_sample` [s] by which commands act earlier."""
     return replace(physics, lag=max(physics.lag + physics.delay - command_to_sample, 1e-5), delay=0.0)
 
 
@@ -130,12 +130,12 @@ def respond(
 
 @dataclass(frozen=True)
 class Simulator:
-    """One arm at one sampling rate, with everything that its motions have in common computed once."""
+    """An arm at one sampling rate; quantities common to all its motions are computed only once."""
 
     physics: Physics
     bristly: bool
     moving: Array
-    """Constants without dry friction where bristles model it."""
+    """Constants, with dry friction set to zero where bristles model it."""
     late: Array
     step: float
     """Integration step [s]."""

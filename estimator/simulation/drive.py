@@ -33,7 +33,7 @@ def torque_and_slopes(
 ) -> tuple[Array, Array]:
     """Return `motor_torque` and its derivatives (2, joints, samples, steps) [N m/s] with respect to delay and lag.
 
-    Without a lag, the two derivatives are equal, as for a tiny lag.
+    Without a lag, the two derivatives are equal, as they are in the limit of a small lag.
     If a command changes exactly at the edge of a step and there is no lag, the derivative with respect to delay is
     one-sided, towards smaller delays.
     """

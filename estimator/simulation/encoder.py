@@ -37,7 +37,7 @@ def slopes_without_errors(physics: Physics, position: Array) -> Array:
 
 
 def by_motion(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the parameters among `names` on which the motion depends if no spring pulls the arm to a reading."""
+    """Return the parameters in `names` that affect the motion if no spring pulls the arm to encoder readings."""
     return tuple(name for name in names if kind_of(name) not in ENCODER)
 
 
@@ -48,8 +48,9 @@ def measured_and_slopes(
 
     The derivatives are with respect to `names`, then the initial state.
 
-    position: true angles (joints, samples) [rad]. derivative: derivatives of the true angles (joints, samples, causes)
-    with respect to `moving`, those of `names` on which the motion depends, then the initial state.
+    moving: the parameters among `names` on which the motion depends. position: true angles (joints, samples) [rad].
+    derivative: derivatives of the true angles with respect to `moving`, then the initial state (joints, samples,
+    causes).
     """
     wanted = [name for name in names if kind_of(name) in ENCODER]
     if not wanted and not physics.encoder.any():
@@ -76,5 +77,5 @@ def _steepness(physics: Physics, position: Array) -> Array:
 
 
 def _waves(position: Array) -> Array:
-    """Return the error waves in the order of ENCODER (joints, samples, terms)."""
+    """Return the sines and cosines by which the errors in ENCODER are multiplied (joints, samples, terms)."""
     return np.stack((np.sin(position), np.cos(position), np.sin(2.0 * position), np.cos(2.0 * position)), axis=2)

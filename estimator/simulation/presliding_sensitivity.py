@@ -1,8 +1,8 @@
 """Forward sensitivities of an arm with presliding friction.
 
-`hil.estimator.simulation.bristles` splits a step. Here the derivatives of the parts are propagated together with those
-of the arm's own step, in which the bristles' torque is an additional offset and their damping additional viscous
-friction.
+`hil.estimator.simulation.bristles` splits each step into parts. Here, the derivatives of the bristles' parts are
+propagated together with those of the arm's part, in which the bristles' torque is an additional offset and their
+damping additional viscous friction.
 """
 
 import math
@@ -192,7 +192,9 @@ def _press(rows: Any, here: Any, bristles: Any, now: int, count: int) -> None:
 
 
 def _accelerate(bristles: Any, Z: Any, kept: float, share: float, count: int) -> None:
-    """Set the accelerations' derivatives to `kept` times the previous ones plus `share` times the velocities'."""
+    """Set the derivatives of the accelerations: `kept` times their previous values plus `share` times the derivatives
+    of the velocities.
+    """
     faster_by = bristles[4]
     for joint in range(2):
         r, z = joint * WIDE, (2 + joint) * WIDE

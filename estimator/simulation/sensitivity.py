@@ -10,8 +10,8 @@ A parameter only enters through the residuals of W k = f, of M' a = f' and of th
 e changes the new velocity by A r + B g + C e, where A, B and C are two-by-two matrices common to all parameters.
 Therefore each further parameter costs a few dozen operations per step instead of another simulation.
 
-For vector instructions, rows of derivatives are WIDE apart in one-dimensional arrays, and are processed one step behind
-the rest, since reading several values at a time stalls if they have just been written one by one.
+For vector instructions, rows of derivatives are WIDE elements apart in one-dimensional arrays, and are processed one
+step behind the rest, since reading several values at a time stalls if they have just been written one by one.
 """
 
 import math
@@ -162,7 +162,7 @@ class Sensitive:
 #   spring         stiffness and target angle of the springs, and the target's derivatives by encoder errors
 #   at             the column of each cause
 def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> None:  # noqa: PLR0915 a call costs time
-    """Compute a drive's torque minus friction and the slope of friction, with all derivatives, into `room`."""
+    """Write a drive's torque minus friction, the slope of friction, and all derivatives to `room`."""
     rows, numbers, here, left, slope, dt, _, at = room
     q, v = here[0, joint], here[1, joint]
     viscous, coulomb, offset, width = p[VISCOUS + joint], p[COULOMB + joint], p[OFFSET + joint], p[WIDTH + joint]
@@ -242,7 +242,7 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
 
 
 def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple[float, float]:
-    """Return the first row of the mass matrix; compute torques, slopes of friction and all derivatives into `room`.
+    """Return the first row of the mass matrix; write torques, slopes of friction and all derivatives to `room`.
 
     t1, t2: motor torques [N m].
     """

@@ -102,13 +102,13 @@ class FakeBus:
 
     @property
     def servos(self) -> dict[int, EmulatedServo]:
-        """The servos by current ID (the last if several share one), in their state at the clock's current time."""
+        """The servos by current ID, advanced to the clock's current time; of servos that share an ID, only the last."""
         self.advance(self.clock.now())
         return {servo.id: servo for servo in self._servos}
 
     @property
     def hand(self) -> Hand:
-        """The hand that moves joints whose torque is off, in its state at the clock's current time."""
+        """The hand that moves joints whose torque is off, advanced to the clock's current time."""
         self.advance(self.clock.now())
         return self._hand
 
@@ -234,7 +234,7 @@ class FakeBus:
             self._move_plant(until)
 
     def _advance_by_events(self, until: float) -> None:
-        """Advance, stopping at each tick, fault and watchdog trip so that it affects the plant from then on."""
+        """Advance, pausing at each tick, fault and watchdog trip, so that each affects the plant from then on."""
         while self._now < until:
             counting = [servo for servo in self._servos if servo.watchdog_s]
             trip = min((servo.heard_at + servo.watchdog_s for servo in counting), default=math.inf)
@@ -269,7 +269,7 @@ class FakeBus:
         self._now = until
 
     def _servo_changed(self) -> None:
-        """Update routing and ticking after a servo's ID or need for ticks has changed."""
+        """Update routing and ticks after a change in a servo's ID or in its need for ticks."""
         self._instructions.route()
         self._ticks_wanted()
 

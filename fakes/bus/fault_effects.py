@@ -58,7 +58,7 @@ def end(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], pl
 def put_with_faults(faults: Faults, wire: "Wire", servo_id: int, data: bytes, start: float, now: float) -> float:
     """Put a reply on the wire as modified by the active faults; return the time at which the transmission ends.
 
-    start, now: start of the transmission, on the clock and counted from the creation of the bus [s].
+    start: start of the transmission, on the clock [s]. now: the same time, counted from the creation of the bus [s].
     """
     late_s = 0.0
     copies = 1

@@ -58,7 +58,7 @@ class FaultKind(StrEnum):
 
 
 class FaultFacts(NamedTuple):
-    """Effect of a kind of fault, and the meaning and default of its `amount`."""
+    """The effect of one kind of fault, and the meaning and default of its `amount`."""
 
     does: str
     amount: str = ""
@@ -147,7 +147,7 @@ class Fault(Described):
 
 
 class Happened(NamedTuple):
-    """A fault that took effect: time [s since the bus was created], kind, and servo (None: no particular one)."""
+    """A fault that took effect: time [s since the bus was created], kind, and servo (None if no particular servo)."""
 
     time: float
     kind: FaultKind

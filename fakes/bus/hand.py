@@ -4,8 +4,8 @@
     bus.hand.move(Move(servo=2, ticks=3000, at=4.0, duration=2.0))
     bus.hand.release(2)
 
-Moves can also be given in TOML, as `[[fake.moves]]` with the same keys, on the command line, as `--move 2:to=0.5,at=4`,
-and, while a fake terminal is being served, with `hil hand /tmp/arm 2:to=0.5`.
+Moves can also be given in TOML, as `[[fake.moves]]` with the same keys; on the command line, as `--move 2:to=0.5,at=4`;
+and with `hil hand /tmp/arm 2:to=0.5`, while a fake terminal is being served.
 
 The hand overcomes friction and gravity but never opposes motor torque: it does not grip a joint whose torque is on, and
 releases a joint as soon as one of its servos switches torque on.
@@ -74,7 +74,8 @@ class _Grip:
 class Hand:
     """The hand of one bus. Times are in seconds since the bus was created.
 
-    tell: called whenever a move, grip or release may have changed `busy`: while busy, the hand needs the bus's ticks.
+    tell: called whenever a move, grip or release may have changed `busy`. While the hand is busy, it needs the bus's
+    ticks.
     """
 
     def __init__(self, joints: Joints, plant: Plant, time: Callable[[], float], tell: Callable[[], None]) -> None:

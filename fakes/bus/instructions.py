@@ -37,7 +37,8 @@ class Line(Protocol):
     def send(self, replies: Sequence[Reply], now: float) -> None:
         """Put replies on the wire.
 
-        Each starts with its delay after the end of the previous one; the first delay counts from `now`.
+        Each reply starts after its own delay, which counts from the end of the previous reply or, for the first, from
+        `now`.
         """
         ...
 
@@ -67,7 +68,7 @@ class Line(Protocol):
 
 
 class Instructions:
-    """How the servos on a line act on packets. `route` must be called whenever an ID has changed."""
+    """Makes the servos on a line act on packets. `route` must be called whenever an ID has changed."""
 
     def __init__(self, servos: Sequence[EmulatedServo], line: Line) -> None:
         self._servos = tuple(servos)
@@ -261,7 +262,7 @@ class Instructions:
         self._line.send(replies, now)
 
     def _fast_read(self, parts: Sequence[Part], now: float) -> None:
-        """Send one packet from all servos; each appends its part and a CRC over everything so far."""
+        """Send one packet from all servos; each servo appends its part and a CRC over everything sent so far."""
         size = 1 + sum(length + 4 for _, _, length in parts)
         if not parts or size > MAX_LENGTH:
             return
@@ -283,7 +284,7 @@ class Instructions:
         self._line.send(replies, now)
 
     def _append(self, answers: list[Reply], replies: list[Reply]) -> bool:
-        """Append to `replies` what one ID's servos send; return whether the next servo hears one intact reply."""
+        """Append the replies of an ID's servos to `replies`; return whether the next servo hears one intact reply."""
         pieces = self._overlaid(answers)
         replies += pieces
         return len(pieces) == 1 and pieces[0][2] == answers[0][2]

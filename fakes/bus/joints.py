@@ -1,7 +1,7 @@
-"""Assignment of servos to joints: usually one per joint, or two if a pair drives it.
+"""Assignment of servos to joints: usually one per joint, or two if the joint is driven by a pair.
 
 Two servos on one joint share its angle; the plant receives the sum of their motor currents. Each servo measures the
-current it commands plus its share of the deviation due to the current loop's lag.
+current that it commands, plus its share of the deviation due to the current loop's lag.
 """
 
 from collections.abc import Sequence

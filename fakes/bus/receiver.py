@@ -19,13 +19,13 @@ _packet = partial(tuple.__new__, Packet)  # half the time of Packet(...)
 
 
 class Receiver:
-    """Finds packets like `hil.drivers.packet.Framer(damaged=True)`, with a fast path for complete, valid ones."""
+    """Finds packets as `hil.drivers.packet.Framer(damaged=True)` does, with a fast path for complete, valid ones."""
 
     def __init__(self) -> None:
         self._framer = Framer(damaged=True)
         self._length = 0
         self._asked: dict[bytes, Packet] = {}
-        """Cache of group reads, keyed by their bytes, since a host sends the same reads repeatedly."""
+        """Cache of parsed group reads, keyed by their bytes; a host sends the same reads repeatedly."""
 
     def feed(self, data: bytes) -> list[tuple[Packet, int]]:
         """Take bytes as they arrive; return each complete packet and the number of bytes that follow it."""

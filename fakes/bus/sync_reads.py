@@ -1,7 +1,7 @@
 """Precomputed group reads of the control cycle.
 
-They read Present Current, Velocity and Position of several servos, or registers without measurements, such as goals.
-They return the same bytes as the general path in `hil.fakes.bus.instructions` in half the time.
+These requests read Present Current, Velocity and Position of several servos, or registers without measurements, such as
+goals. The replies are the same as those of the general path in `hil.fakes.bus.instructions`, but take half the time.
 """
 
 import functools

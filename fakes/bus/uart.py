@@ -7,7 +7,7 @@ _STOP = 9  # index of the stop bit among the ten bits of a byte: start, eight da
 
 
 def heard(data: bytes, sent_baud: int, heard_baud: int) -> list[tuple[int, float]]:
-    """Return the bytes that a receiver at `heard_baud` reads while `data` is sent at `sent_baud` without pauses.
+    """Return the bytes that a receiver set to `heard_baud` reads while `data` is sent at `sent_baud` without pauses.
 
     Each byte is paired with the time at which it is complete [s after the first start bit]. The receiver samples the
     middle of each bit and passes on bytes with a wrong stop bit, as USB adapters do.
@@ -38,7 +38,9 @@ def _line(data: bytes) -> list[int]:
 
 
 def _received(line: list[int], ratio: float) -> list[tuple[int, float]]:
-    """Return the bytes read from a line, and when each is complete [bits]. ratio: sender bits per receiver bit."""
+    """Return the bytes read from a line, and the time [bits] at which each is complete. ratio: sender bits per receiver
+    bit.
+    """
     received: list[tuple[int, float]] = []
     at = 0.0
     while (start := _falling_edge(line, at)) is not None:

@@ -161,7 +161,7 @@ class Wire:
         self._arriving = deque(segment for segment in kept if segment.data)
 
     def collide(self, start: float, end: float) -> bool:
-        """Return whether a transmission from `start` to `end` collides with one by a servo.
+        """Return whether a transmission from `start` to `end` collides with a servo's transmission.
 
         If so, the servo's bytes from `start` on are lost. The other transmission is lost because the caller does not
         deliver it.

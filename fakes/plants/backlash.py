@@ -152,8 +152,8 @@ class _Links:
 
     @property
     def lightness(self) -> float:
-        """Upper bound, over all poses, on the acceleration per unit of torque at the joints [1/(kg m^2)]: the
-        trace of the mass matrix divided by its determinant.
+        """Upper bound for all poses on the acceleration per unit of joint torque [1/(kg m^2)]: the trace of the mass
+        matrix divided by its determinant.
         """
         if len(self.angle) == 1:
             return 1.0 / self._first

@@ -75,7 +75,7 @@ class SpatialChain:
         run(self._chain, self._drive, self._held, self._state, command, remaining, longest, self._work, self._room)
 
     def equations(self, q: Sequence[float], v: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mass matrix, and the torques for which the acceleration is zero, in a given state.
+        """Return, for a given state, the mass matrix and the torques at which the acceleration is zero.
 
         The mass matrix (joints, joints) [kg m^2] excludes the rotors; the torques are (joints,) [N m].
         """

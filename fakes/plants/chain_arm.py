@@ -1,4 +1,4 @@
-"""Description of a spatial fake arm: the links of a URDF, how the true links differ from them, and the drives."""
+"""Description of a spatial fake arm: the links of a URDF, deviations of the true links from them, and the drives."""
 
 from pathlib import Path
 from typing import Annotated, Self

@@ -1,6 +1,6 @@
 """Compiled equations of motion of a spatial arm from its links' masses, centres of mass and inertias.
 
-Kane's equations: the Jacobians Jv and Jw of each link's centre of mass yield mass matrix and bias forces,
+By Kane's equations, the Jacobians Jv and Jw of each link's centre of mass yield the mass matrix and the bias forces,
 
     M = sum of m Jv'Jv + Jw' I Jw        bias = sum of Jv' m (a - g) + Jw' (I alpha + omega x I omega)
 
@@ -26,7 +26,7 @@ DRIVE = 16
 
 
 def _frames(rotation: Any, shift: Any, axis: Any, q: Any, turn: Any, at: Any, z: Any) -> None:
-    """Compute each link's rotation and its joint's position and axis in the base frame, into `turn`, `at` and `z`."""
+    """Write each link's rotation, and its joint's position and axis, all in the base frame, to `turn`, `at` and `z`."""
     for i in range(q.size):
         for r in range(3):
             if i == 0:
@@ -58,7 +58,7 @@ def _frames(rotation: Any, shift: Any, axis: Any, q: Any, turn: Any, at: Any, z:
 
 
 def _equations(chain: Any, q: Any, v: Any, work: Any) -> None:  # noqa: PLR0912
-    """Compute the mass matrix and bias forces in this state, into `work`."""
+    """Compute the mass matrix and bias forces in this state, and write them to `work`."""
     rotation, shift, axis, gravity, mass, centre, inertia = chain
     turn, at, z, jv, spin, M, bias = work
     n = q.size
@@ -124,7 +124,7 @@ def _equations(chain: Any, q: Any, v: Any, work: Any) -> None:  # noqa: PLR0912
 
 
 def _push(d: Any, j: int, step: float, command: float, q: float, v: float, amps: Any, out: Any) -> None:
-    """Compute the effect of drive `j` during one step, into the rows of `out`.
+    """Compute the effect of drive `j` during one step, and write it to the rows of `out`.
 
     The rows are: mean torque without stiction, level of dry friction, slope of the smooth friction, and the current at
     the end of the step.

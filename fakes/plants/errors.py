@@ -2,4 +2,4 @@
 
 
 class PlantError(ValueError):
-    """A plant cannot be created, or has returned an invalid state. The message names it and states what is required."""
+    """A plant cannot be created or has returned an invalid state. The message names it and states the requirement."""

@@ -57,7 +57,7 @@ class Pendulum:
                 self._step(step - taken, command, False)
 
     def _step(self, step: float, command: float, cut: bool) -> float:
-        """Take one step or, with `cut`, only the part up to a sign change of the velocity; return its length [s]."""
+        """Take one step and return its length [s]; with `cut`, end the step where the velocity changes sign."""
         half = 0.5 * step
         v = self._v
         middle_v = v + half * self._a if v else 0.0

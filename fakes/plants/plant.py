@@ -24,7 +24,7 @@ from hil.fakes.plants.two_link import TwoLink
 
 
 class Plant(Protocol):
-    """A mechanism with one motor per joint, advanced by the bus only as needed, in the bus's own time.
+    """A mechanism with one motor per joint. The bus advances it only as needed, in the bus's own time.
 
     Angles and velocities are those of the servos' output shafts: joint 1 is measured from the horizontal, joint 2
     relative to link 1 (two-link arm). `current` is the actual motor current, after the current loop's lag.
@@ -112,12 +112,11 @@ _searched: list[str] = []
 def load_plant(name: str, options: Mapping[str, object], folder: Path | None = None) -> Plant:
     """Create a plant by calling `module:factory` with these options; raises PlantError.
 
-    Factories outside `OWN_PLANTS` require `allow_code`. folder: a further folder in which to look for the module.
+    Factories outside `OWN_PLANTS` require `allow_code`. folder: additional folder in which to look for the module.
     """
     if name not in OWN_PLANTS and not _leave["code"]:
         raise PlantError(
-            f'plant = "{name}" is code that this file wants to run, with {dict(options)}: nothing was run. Inspect '
-            "this code; "
+            f'plant = "{name}": this file would run this code with {dict(options)}; nothing was run. Inspect the code; '
             "if you trust the file, use --allow-code, or hil.fakes.allow_code() in Python. Otherwise, only "
             f"{' and '.join(sorted(OWN_PLANTS))} are allowed"
         )
@@ -134,7 +133,9 @@ def load_plant(name: str, options: Mapping[str, object], folder: Path | None = N
         raise PlantError(text) from error
     found = Path(getattr(module, "__file__", None) or "")
     if folder and folder != found.parent and str(found.parent) in _searched and (folder / found.name).is_file():
-        raise PlantError(f'plant = "{name}" is the one in {found} in this process, not in {folder}; rename one')
+        raise PlantError(
+            f'plant = "{name}": this process has already loaded {found}, not the module in {folder}; rename one of them'
+        )
     try:
         plant = factory(**options)
     except PlantError:

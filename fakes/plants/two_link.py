@@ -7,9 +7,9 @@ Kinetic energy, where w1 = q1' and w2 = q1' + q2' are the links' angular velocit
     link 2      m2 (l1^2 w1^2 + c2^2 w2^2 + 2 l1 c2 w1 w2 cos(phi2 - phi1)) / 2 + J2 w2^2 / 2
     rotors      n1^2 Jr1 q1'^2 / 2 + n2^2 Jr2 q2'^2 / 2
 
-Lagrange's equations are derived in phi1, phi2, whose generalised forces are tau1 - tau2 and tau2; in the joint angles,
-the first equation is their sum, and the second remains the same. The estimator models the same arm independently, as a
-regressor in base parameters; a test compares the two.
+Lagrange's equations are derived in phi1, phi2, whose generalised forces are tau1 - tau2 and tau2. In the joint
+angles, the first equation is the sum of both equations, and the second remains the same. The estimator models the same
+arm independently, as a regressor in base parameters; a test compares the two.
 
 Time integration is symmetric and second-order: drift half a step, kick with the step's mean motor torque and the
 friction at its middle, drift half a step. Dry friction is an impulse on each joint, limited to the friction level times
@@ -116,8 +116,8 @@ def _run(  # noqa: PLR0912, PLR0915
 ) -> State:
     """Integrate over `remaining` [s] in steps of at most `longest` [s] with commanded currents [A].
 
-    This is one long loop on local floats because a fake arm spends most of its time here: with a function call per step
-    it takes 1.5 times as long. A step in which a joint's velocity changes sign is first taken up to that point (`cut`).
+    This is one long loop with local floats because a fake arm spends most of its time here: with a function call per
+    step, it takes 1.5 times as long. A step in which a joint's velocity changes sign is split at that point (`cut`).
 
     arm: `TwoLink._terms`. drives: `Motor.plain` of both motors. motors: None if both are plain, the only compiled case.
     """
@@ -266,7 +266,7 @@ def _shrunk(impulse: float, limit: float) -> float:
 
 @cache
 def _compiled() -> Callable[..., State]:
-    """Return the compiled loop; from then on, the interpreted loop also calls compiled functions."""
+    """Return the compiled loop; after this call, the interpreted loop calls compiled functions, too."""
     import numba
 
     inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]

@@ -61,7 +61,7 @@ class Backup:
         return StatusError.NONE
 
     def restore(self, memory: Memory, *, eeprom: bool) -> None:
-        """Write the copy back, including its EEPROM area if `eeprom`; do nothing if there is no copy."""
+        """Write the copy back, including its EEPROM area if `eeprom` is set; do nothing if there is no copy."""
         for name, value in (self._values or {}).items():
             register = memory.registers[name]
             if eeprom or not register.eeprom:

@@ -2,7 +2,7 @@
 
 Source: the block diagrams and gain units of the ROBOTIS e-Manual (pages x/<model>, Velocity PI Gain, Position PID
 Gain). The units are 1/128 for P gains, 1/65536 for I gains, 1/16 for the D gain, 1/4 and 1 for the feedforward gains.
-Uncertain are the period of the control loop (1 ms here), the signal that the D gain multiplies, and the filters.
+The period of the control loop (1 ms here), the signal that the D gain multiplies, and the filters are uncertain.
 """
 
 import math
@@ -38,7 +38,7 @@ _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 
 
 def obeyed_current(memory: Memory) -> int:
-    """Return Goal Current as applied [ticks], limited even if it was written before Current Limit was lowered."""
+    """Return the applied Goal Current [ticks]; Current Limit holds even if lowered after the goal was written."""
     goal, limit = memory.get("Goal Current"), memory.get("Current Limit")
     return max(-limit, min(limit, goal))
 
@@ -196,9 +196,11 @@ class Controller:
 
 
 def _shape(away: float, velocity: float, fastest: float, hardest: float) -> int:
-    """Return the bits of Moving Status for a move of `away` ticks: a triangular one stays below its velocity limit.
+    """Return the bits of Moving Status that state the shape of the velocity profile for a move of `away` ticks.
 
-    velocity: at the start [ticks/ms]. fastest, hardest: as returned by `profile`.
+    The profile is triangular if it does not reach its velocity limit.
+
+    velocity: velocity at the start [ticks/ms]. fastest, hardest: as returned by `profile`.
     """
     if not hardest:
         return _RECTANGLE

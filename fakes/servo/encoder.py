@@ -1,7 +1,7 @@
 """Encoder errors: noise, and errors that are periodic over a turn.
 
-In a magnetic encoder, a magnet off the shaft's axis causes an error with a period of one turn; a tilted magnet, or
-channels that differ in amplitude or are not in quadrature, cause one with a period of half a turn.
+In a magnetic encoder, an off-axis magnet causes an error with a period of one turn. A tilted magnet, or channels that
+differ in amplitude or are not in quadrature, cause an error with a period of half a turn.
 """
 
 import math

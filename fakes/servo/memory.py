@@ -7,7 +7,7 @@ from hil.fakes.servo.registers import EmulatedModel, Register
 
 
 class Memory:
-    """Registers as bytes. `hil.fakes.servo.servo` decides which writes are permitted and what they cause."""
+    """Registers as bytes. `hil.fakes.servo.servo` decides which writes are permitted and what effects they have."""
 
     def __init__(self, model: EmulatedModel) -> None:
         self.registers = model.registers
@@ -77,7 +77,7 @@ class Memory:
                     self._points[first_data + index] = target
 
     def split(self, address: int, data: bytes) -> tuple[list[tuple[Register, int]], int]:
-        """Return the registers and values in a write, and an error number if it violates register boundaries."""
+        """Return the registers and values in a write, and an error number if the write violates register boundaries."""
         if not (self._points and self.is_indirect(address, len(data))):
             return self._split_stretch(address, data)
         writes: list[tuple[Register, int]] = []

@@ -5,7 +5,7 @@ of the e-Manual's repository ROBOTIS-GIT/emanual (revisions of 2018 to 2024). Di
 of Min Voltage Limit, given there as 110 to 300 with a factory value of 95, is 95 to 160 here, as on the sister models.
 Protocol Type only accepts 2, because a fake servo does not support any other. Drive Mode accepts bit 3 (Torque On by
 Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the others. Velocity Limit of
-the XH430-W210 is that of the XD430-T210; its own oldest page states 360.
+the XH430-W210 is that of the XD430-T210, although the oldest page of the XH430-W210 itself states 360.
 
 Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
 tens of percent, which is enough to make a position move look right.
@@ -38,7 +38,7 @@ class Motor(NamedTuple):
 
     @property
     def resistance_ohm(self) -> float:
-        """Resistance between its terminals [ohm]."""
+        """Resistance between the motor's terminals [ohm]."""
         return round(self.voltage_v / self.stall_a, 1)
 
     @property
@@ -51,7 +51,7 @@ class Motor(NamedTuple):
 class ModelFacts:
     """Properties that differ between models.
 
-    motor: its motor at the nominal voltage.
+    motor: data of the motor at the nominal voltage.
     differs: registers whose properties differ from those of the X series.
     current_unit_a: current per tick of Goal and Present Current [A].
     fast_read_firmware: first firmware with fast reads and Control Table Backup.
@@ -66,7 +66,7 @@ class ModelFacts:
     """Whether Present Current is the supply current instead of the motor current (330 series)."""
     indirect: Blocks = ((168, 224, 28), (578, 634, 28))
     indirect_of_firmware: tuple[int, Blocks] | None = None
-    """The only firmware version whose blocks differ from these, and its blocks."""
+    """The only firmware version with different blocks, and these blocks."""
 
 
 _Facts = RegisterFacts

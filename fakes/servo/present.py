@@ -98,7 +98,7 @@ class Present:
     def clear(self, body: bytes, moving: bool, position: float) -> int:
         """Execute the instruction Clear (reset the turn count); return the error number.
 
-        Errors other than Result Fail are uncertain.
+        Whether real servos return the same error numbers is uncertain, except for Result Fail.
         """
         if len(body) != len(_CLEAR_TURNS):
             return StatusError.DATA_LENGTH
@@ -181,7 +181,7 @@ class Present:
         self._memory.set("Realtime Tick", tick)
 
     def forget_turns(self, position: float) -> None:
-        """Reset Present Position at a joint angle [rad] to its value within one turn, before Homing Offset."""
+        """Remove whole turns from Present Position, before Homing Offset is added, at a joint angle [rad]."""
         self._turn_ticks = 0
         self._shift_changed()
         raw = round(self.ticks(position)) - self._homing_ticks()

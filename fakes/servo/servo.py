@@ -96,9 +96,9 @@ class EmulatedServo(Powered):
         """False if the bus cable is disconnected: the servo neither receives nor replies; the motor keeps its command.
         """
         self.heard_at = 0.0
-        """Time at which it received the last instruction packet [s], from which the Bus Watchdog counts."""
+        """Time at which the servo received its last instruction packet [s]; the Bus Watchdog counts from then."""
         self.ready_at = 0.0
-        """Time at which it has finished booting [s]; it does not respond before then."""
+        """Time at which the servo finishes booting [s]; it does not respond before then."""
         self.present = Present(
             *(self.memory, model, zero_ticks, direction, 1.0 + 1e-6 * clock_error_ppm, current_noise_a),
             Random(f"current {seed} {servo_id}") if current_noise_a else None,
@@ -253,7 +253,7 @@ class EmulatedServo(Powered):
     ) -> tuple[int, bytes]:
         """Execute an instruction addressed to this servo; return the error number and data of the status packet.
 
-        The error number excludes the Alert bit. shadow: the instruction was addressed to the Secondary ID. The
+        The error number excludes the Alert bit. shadow: whether the instruction was addressed to the Secondary ID. The
         instruction Read is not handled here: the bus calls `read` after updating the measurements.
         """
         if instruction in (Instruction.WRITE, Instruction.REG_WRITE) and len(body) < 3:
@@ -428,7 +428,7 @@ class EmulatedServo(Powered):
         self._current_per_tick = self.present.sign * self.model.current_unit_a
         moves = self._torque and bool(self.model.operating_modes)
         self.needs_ticks = self.health.changes or (moves and (self._mode != CURRENT_MODE or self._voltage_limited))
-        """Whether its state changes with time alone, so that the bus must call `tick`."""
+        """Whether the servo's state changes with time alone, so that the bus must call `tick`."""
 
         if self._driven:
             self.motor_current_a = self.goal_current_ticks * self._current_per_tick
@@ -438,7 +438,7 @@ class EmulatedServo(Powered):
         by_goal = memory.get("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE
         accepts = bool(self.model.operating_modes) and not by_goal and watchdog != WATCHDOG_TRIPPED
         self._goal_pwm_limit = memory.get("PWM Limit") if accepts and "Goal PWM" in memory else -1
-        """Largest Goal PWM on the fast path [ticks]; -1 if the general path is used."""
+        """Largest Goal PWM that the fast path accepts [ticks]; -1 if every write takes the general path."""
         # The fast path bypasses the controller, in which the supply or, in one mode, the goal limits the current.
         by_controller = self._voltage_limited or self._mode == CURRENT_POSITION_MODE
         self._takes_goal_current = accepts and not by_controller and self._current_limit >= 0

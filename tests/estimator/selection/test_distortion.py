@@ -56,7 +56,7 @@ def test_what_the_model_lacks_stands_on_the_lines_that_it_makes(
     assert np.all(found.odd.left > 5.0 * found.noise)
     assert np.all(found.odd.left > 4.0 * found.even.left)
     said = " ".join(judge(estimate, validate(period, estimate), Evidence()).sentences)
-    assert "odd lines indicates friction or ripple" in said
+    assert "odd harmonics indicates friction or ripple" in said
 
 
 def test_with_every_line_driven_odd_and_even_cannot_be_told(ideal_period: SettledPeriod) -> None:

@@ -230,7 +230,9 @@ def test_the_module_of_a_plant_may_be_beside_the_toml_file(tmp_path: Path, monke
     bus = make_bus(load_fake(first).model_copy(update={"seed": 3}), VirtualClock())
     bus.advance(1.5)
     assert bus.plant.position == [3.0]
-    with pytest.raises(PlantError, match=f"is the one in {first.parent}/.* not in {second.parent}; rename one$"):
+    with pytest.raises(
+        PlantError, match=f"already loaded {first.parent}/.* not .* in {second.parent}; rename one of them$"
+    ):
         make_bus(load_fake(second), VirtualClock())
     monkeypatch.delitem(sys.modules, "plant_of_this_test")
     fakes.allow_code(False)
