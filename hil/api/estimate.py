@@ -127,7 +127,7 @@ def _from_files(paths: list[Path], config: Path | None, out: PathLikeStr | None)
 
 
 def _discard(folder: Path) -> None:
-    """Remove a folder that holds no result. If it is already gone, the error being handled says so."""
+    """Remove a folder that holds no result. Do nothing if the folder does not exist."""
     if not (folder / "result.json").is_file():
         with suppress(FileNotFoundError):
             for path in folder.iterdir():

@@ -271,8 +271,8 @@ def _of_box(centre: Array, size: Array) -> list[tuple[Array, float]]:
 def _from_joints(arm: ArmDescription, link: int, fixed: list[Array]) -> list[Capsule]:
     """A capsule from the link's joint to the next one.
 
-    The last link's capsule ends at the farthest frame fixed to it or, if farther, at twice the distance of its centre
-    of mass.
+    The last link's capsule ends at the farthest frame fixed to the link or at twice the distance of its centre of mass,
+    whichever is farther from the joint.
     """
     if link < len(arm.joints):
         end = arm.joints[link].translation
@@ -296,6 +296,6 @@ def _origin(element: ET.Element) -> tuple[Array, Array]:
 
 
 def _numbers(text: str | None, count: int, default: float = float("nan")) -> list[float]:
-    """Parse `count` numbers; return only defaults if there is no text, only NaN if it holds more or fewer numbers."""
+    """Parse `count` numbers. Without text, all are `default`; if the text holds more or fewer, all are NaN."""
     found = [default] * count if text is None else [float(word) for word in text.split()]
     return found if len(found) == count else [float("nan")] * count

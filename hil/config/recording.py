@@ -110,7 +110,7 @@ def _without(table: dict[str, Any], used: type[BaseModel], known: type[BaseModel
 
 
 def _with_urdf_beside(values: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the tables; arm.urdf, if relative, is resolved against the TOML file's folder."""
+    """Return the tables, with a relative arm.urdf resolved against the TOML file's folder."""
     arm = values.get("arm")
     if isinstance(arm, dict) and isinstance(arm.get("urdf"), str):
         return {**values, "arm": {**arm, "urdf": str(path.parent / arm["urdf"])}}

@@ -26,7 +26,7 @@ class ChainDryRun:
     amplitude; 1 if [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of
     links with parts that are closer than the margin in nearly every pose and thus not checked. refused: why the pilot
     has no safe first step; "" if it has one, None without a pilot. The pilot's decision overrides the prediction.
-    on_stops: sentence that names the joints assumed to rest on their own mechanical stops; "" if there are none.
+    on_stops: sentence that names the joints assumed to rest against their own stops; "" if there are none.
     """
 
     config: Config

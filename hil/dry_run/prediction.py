@@ -28,7 +28,7 @@ from hil.plan.stabiliser import feedback_of
 QUANTITIES = ("lowest position", "highest position", "velocity", "current", "torque", "power")
 UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")
 GUARDED = 3
-"""Number of leading quantities at whose limits the guard stops the arm. Current is clamped instead; torque and power
+"""The guard stops the arm at the limits of the first three quantities. Current is clamped instead; torque and power
 follow from the other quantities.
 """
 
@@ -43,7 +43,7 @@ class Prediction:
     """The prediction of a dry run.
 
     values: extreme values of every arm (arms, quantities, joints), in the order of QUANTITIES and in UNITS. shares: the
-    same as fractions of the distance from rest to the limit. limits: limits (quantities, joints). settled_after: number
+    same values as fractions of the distance from rest to the limit. limits: limits (quantities, joints). settled_after: number
     of periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over time
     of a few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: samples per
     second [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at rest or centre,

@@ -24,7 +24,7 @@ def roomy_plan(config: Config, physics: Physics) -> Plan:
     """The configured plan, with the variant of each multisine that uses the largest part of the arm's position range.
     physics: parameters of the arm.
 
-    Reversing the sign or time of a wave gives another wave with the same lines and peaks.
+    Reversing the sign or time of a wave gives another wave with the same spectrum and peaks.
     """
     return roomy_plans(config, physics, 1)[0]
 

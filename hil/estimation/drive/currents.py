@@ -98,8 +98,8 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
 
 
 def _noise(goal: Array, measured: Array) -> float:
-    """Standard deviation of a current reading, estimated from the recording as the larger of two values: its scatter at
-    constant goals, and its deviation from the goals or, if smaller, the second difference of that deviation.
+    """Standard deviation of a current reading, estimated from the recording. It is the larger of two values: the scatter
+    at constant goals, and the scatter of the deviation from the goals or of its second difference, if that is smaller.
 
     Since the current may lag the goal by a few samples, the lag that leaves the smallest deviation is used.
     """
@@ -162,7 +162,7 @@ def _clipped(name: str, goal: Array, measured: Array, margin: float, lower: str)
 
 
 def _least(goal: Array) -> Array:
-    """The smaller of two successive goals, which the motor has had time to follow; 0 if their signs differ.
+    """The smaller of two successive goals, which the motor has had time to reach; 0 if the goals differ in sign.
 
     A sample's current is the response to the goal of the sample before it, and a lagging current loop is not clipping.
     """
