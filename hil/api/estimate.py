@@ -136,7 +136,7 @@ def _discard(folder: Path) -> None:
 
 
 def _again(folder: Path) -> Estimation:
-    """Repeat an earlier estimate of recordings with the configuration in its folder, and write the result there."""
+    """Repeat an earlier estimate of recordings with the configuration in `folder`, and write the result there."""
     record = load_record(folder)
     found = estimate_recordings([Path(file.path) for file in record.files], folder / "config.toml", folder)
     write_recording_report(folder)

@@ -39,7 +39,7 @@ def unchecked(space: Space) -> Iterator[str]:
 
 
 def near_by_design(space: Space) -> Iterator[str]:
-    """Yield a sentence that lists the pairs of links with parts that need no margin, if there are any."""
+    """Yield one sentence that lists all pairs of links with parts that need no margin; nothing if there are none."""
     if space.near:
         pairs = ", ".join(f"{first} and {second}" for first, second in space.near)
         yield f"Parts of these links are near each other by design; they must not touch, but need no margin: {pairs}."
@@ -80,7 +80,7 @@ def _weak(joint: JointConfig) -> str:
     unit = joint.drive_mode.goal_unit
     return (
         f"{joint.goal_limit_name} of joint {joint.name!r} = {joint.goal_limit:g} {unit} limits its torque to "
-        f"{torque:.2g} N m, but its servos' typical dry friction is {friction:.2g} N m. The joint would probably not "
+        f"{torque:.2g} N m, but its servos' typical dry friction is {friction:.2g} N m. The joint probably would not "
         f"move. It needs about {2.0 * friction / joint.torque_per_goal:.2g} {unit} to move without a load, and more to "
         "lift one."
     )

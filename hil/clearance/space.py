@@ -129,9 +129,7 @@ class Space:
         return Nearest(float(room[sample]) + needed, needed, self.names_of(int(worst[sample])), sample)
 
     def wrong_rest_pose(self) -> str:
-        """Describe the largest overlap in the rest pose that the excess size of the capsules cannot explain; "" if
-        none.
-        """
+        """Describe the largest overlap in the rest pose; "" if the excess size of the capsules could explain it."""
         found = self.nearest(self.rest[:, None])
         if found.distance >= -AT_REST_INSIDE:
             return ""

@@ -332,7 +332,9 @@ def load_config(path: str | PathLike[str]) -> Config:
         raise ConfigError(f"{shortened(str(path))}: {error.strerror}.") from error
     if is_folder:
         if path == Path():
-            raise ConfigError(". cannot be read: it is the current folder (an empty name also means this folder). Name a TOML file.")
+            raise ConfigError(
+                ". cannot be read: it is the current folder (an empty name means the same). Name a TOML file."
+            )
         within = [*path.glob("*.toml")]
         hint = f"; did you mean {within[0]}?" if len(within) == 1 else ". Name a TOML file."
         raise ConfigError(f"{path} cannot be read: it is a folder{hint}")
@@ -425,7 +427,7 @@ def port_url(port: str) -> str:
     """The URL of a port.
 
     `port` can be a URL or a device, which is returned unchanged; a TOML file; the name of a fake arm for other programs
-    (such as `koch`); or the name of a bundled configuration. Raises ConfigError.
+    (`koch`); or, if no such arm exists, the name of a bundled configuration. Raises ConfigError.
     """
     url = _url_of(port)
     fakes.register_for(url)

@@ -203,7 +203,8 @@ class _Tree:
             kind = int(self.model.eq_type[index])
             if kind in LOOPS:
                 raise ArmFileError(
-                    f"{self.path}: the equality constraint <{LOOPS[kind]}> closes a loop, but a serial arm has none: remove it"
+                    f"{self.path}: the equality constraint <{LOOPS[kind]}> closes a loop, which a serial arm does not "
+                    "have: remove it"
                 )
             joint = int(self.model.eq_obj1id[index])
             if kind == COUPLED and self.model.joint(joint).name in names:
@@ -221,8 +222,8 @@ class _Tree:
         return way
 
     def frame(self, body: int, before: int) -> tuple[Array, Array]:
-        """Rotation and position of a body's joint in the frame of the previous moving body, whose origin is its
-        joint.
+        """Rotation and position of a body's joint in the frame of the previous moving body. That frame's origin is the
+        previous joint.
         """
         rotation, translation = np.eye(3), np.zeros(3)
         for part in self._way(body):

@@ -258,7 +258,7 @@ def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) ->
     if not names:
         raise ArmFileError(f"{path}: no joint rotates, so it does not describe an arm")
     if len(set(names)) < len(names):
-        raise ArmFileError(f"{path}: the list of joints ({', '.join(names)}) names one of them twice")
+        raise ArmFileError(f"{path}: in the list of joints ({', '.join(names)}), one is named twice")
     for name in names:
         if name not in tree:
             turning = [joint.name for joint in tree.values() if joint.kind in TURNING]

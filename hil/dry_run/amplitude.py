@@ -192,8 +192,8 @@ def _search(
 def _polished(
     reached_with: Callable[[Array], Array], torque: Array, reached: Array, most: Array, options: AmplitudeOptions
 ) -> Array:
-    """Raise, in small steps, the torque of the joint that uses the least of its range, while all joints stay within
-    limits.
+    """In small steps, raise the torque of the joint that uses the least of its range, as long as all joints stay within
+    their limits.
 
     reached: fraction of the allowed range that each joint uses with `torque`.
     """

@@ -169,8 +169,8 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         f"stops reach the rest pose (at least {100 * LAID_DOWN:.0f} % are required); smallest clearance on the way: "
         f"{lowering.nearest}.",
         f"Without commands (cable unplugged, program killed, servo failed) the arm falls. Hardest fall, starting "
-        f"{fall.moment:.1f} s into the path: {hit} {when} {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, "
-        f"at {fall.speed:.1f} m/s.",
+        f"{fall.moment:.1f} s into the path: {hit} {when} {fall.seconds:.2f} s, having fallen "
+        f"{100 * fall.height:.0f} cm, at {fall.speed:.1f} m/s.",
     ]
     lines += near_by_design(Space.of(run.config))
     if run.on_stops:

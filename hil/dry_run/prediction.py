@@ -43,10 +43,10 @@ class Prediction:
     """The prediction of a dry run.
 
     values: extreme values of every arm (arms, quantities, joints), in the order of QUANTITIES and in UNITS. shares: the
-    same values as fractions of the distance from rest to the limit. limits: limits (quantities, joints). settled_after: number
-    of periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over time
-    of a few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: samples per
-    second [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at rest or centre,
+    same values as fractions of the distance from rest to the limit. limits: limits (quantities, joints). settled_after:
+    number of periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over
+    time of a few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: sampling
+    rate [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at rest or centre,
     whichever is farther from that limit.
     """
 

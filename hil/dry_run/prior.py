@@ -54,8 +54,8 @@ def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
     if lengths is None:
         raise ConfigError(
             f"{config.path}: the effect of a torque on this arm cannot be predicted without its link lengths. Measure "
-            "from joint to joint and to the tip with a ruler, and set arm.link_lengths = [...] in m, one for each of "
-            "[[joints]]; or use an earlier identification in the dry run (--result)."
+            "from joint to joint and to the tip with a ruler, and set arm.link_lengths = [...] in m, one per "
+            "[[joints]] table; or use an earlier identification in the dry run (--result)."
         )
     random = np.random.default_rng((seed, 5))
     drawn = {name: quantity.draw(random, count) for name, quantity in quantities(config, np.array(lengths)).items()}

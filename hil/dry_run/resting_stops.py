@@ -18,11 +18,11 @@ from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan
 
 NEAR_STOP_RAD = 0.14
-"""A joint that lies on its stop is at most this far from the end of its range, as configured or described [rad]."""
+"""A joint that rests against a stop is at most this far from the end of its configured or described range [rad]."""
 
 
 PASSED_RAD = 0.05
-"""A joint that has been this far [rad] beyond its rest pose does not lie on a stop there: no stop yields that much."""
+"""A joint that has been this far [rad] beyond its rest pose has no stop there: no stop yields that much."""
 
 
 def resting_stops(config: Config, arms: ChainArms, planned: Sequence[Array] = (), passed: Mask | None = None) -> Array:
@@ -70,9 +70,9 @@ def said_of_stops(config: Config, side: Array) -> str:
     if not found:
         return ""
     return (
-        "Nothing in the description supports these joints in the rest pose, so each is assumed to lie on its own "
-        f"mechanical stop: {', '.join(found)}. If something else supports them, name it in [clearance] (floor, boxes). "
-        "Otherwise they may sag by up to the angle in brackets before position_limit stops the arm."
+        "Nothing in the description supports these joints in the rest pose, so each is assumed to rest against its "
+        f"own mechanical stop: {', '.join(found)}. If something else supports them, name it in [clearance] (floor, "
+        "boxes). Otherwise they may sag by up to the angle in brackets before position_limit stops the arm."
     )
 
 

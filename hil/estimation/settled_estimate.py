@@ -196,7 +196,7 @@ def _estimate(
     starts: list[dict[str, float]],
     executor: Executor | None,
 ) -> tuple[Estimate, Choice | None]:
-    """Fit the configured model or, if its friction is "auto", the models to choose from; otherwise Choice is None."""
+    """Fit the configured model. If its friction is "auto", choose among models; otherwise the Choice is None."""
     wanted, by_voltage, lever = config.model, voltage_driven(config), lever_of(config)
     if wanted.friction == "auto":
         choice = choose(

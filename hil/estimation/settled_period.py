@@ -47,7 +47,7 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
             f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole "
             + ("period" if whole == 1 else "periods")
             + (
-                f": it ended too early. {wanted} periods, {wanted * count} samples, are needed. Record again."
+                f": it ended too early. {wanted} periods ({wanted * count} samples) are needed. Record again."
                 if whole < wanted
                 else f", in which the motion did not become periodic to within experiment.settle_within = "
                 f"{experiment.settle_within:g} for {experiment.periods} periods. Record again, for longer."

@@ -28,8 +28,8 @@ _RECENT = 4
 
 _BEYOND, _BEYOND_OFTEN = 0.25, 0.02
 """A current counts as different from the commanded one if it is outside the range spanned by 0 and all recent goals by
-more than its noise and this fraction of the largest goal. A warning is given if the fraction of such samples exceeds
-the second value.
+more than its noise and by more than this fraction of the largest goal. A warning is given if the fraction of such
+samples exceeds the second value.
 """
 
 _SIGMAS = 3.0
@@ -37,7 +37,7 @@ _SIGMAS = 3.0
 
 _QUANTILE, _OF_NORMAL = 0.25, 0.3186
 """Noise is estimated from this quantile of its magnitude, because goals that are altered now and then must not count as
-noise; the second value is that of the standard normal distribution.
+noise. The second value is the same quantile for the standard normal distribution.
 """
 
 _FEWEST_AT_REST = 30
@@ -98,10 +98,11 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
 
 
 def _noise(goal: Array, measured: Array) -> float:
-    """Standard deviation of a current reading, estimated from the recording. It is the larger of two values: the scatter
-    at constant goals, and the scatter of the deviation from the goals or of its second difference, if that is smaller.
+    """Standard deviation of a current reading, estimated from the recording.
 
-    Since the current may lag the goal by a few samples, the lag that leaves the smallest deviation is used.
+    It is the larger of two values: the scatter at constant goals, and the scatter of the deviation from the goals (or
+    of that deviation's second difference, if smaller). Since the current may lag the goal by a few samples, the lag
+    that leaves the smallest deviation is used.
     """
     count = len(goal) - _RECENT
     if count < _RECENT:
