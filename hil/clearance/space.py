@@ -24,7 +24,8 @@ design.
 
 NEAR_SHARE, NEAR_SHARE_OF_OTHERS = 0.75, 0.98
 """Two capsules that are closer than BUILT_NEAR in at least this fraction of random poses are near each other by design:
-they must not touch, but need no margin. The first value applies if one link lies between them, the second if more do.
+they must not touch, but need no margin. The first value applies if there is one link between them, the second if there
+are more.
 """
 
 BUILT_NEAR = 0.02  # m beyond the margin

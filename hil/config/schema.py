@@ -286,7 +286,7 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is spatial: [arm] urdf is given, and [joint_path] is given or that arm is not planar."""
+        """Whether the arm is spatial: a description is given that is not planar, or is used with a [joint_path]."""
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property

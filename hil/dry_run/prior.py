@@ -109,7 +109,8 @@ def quantities(config: Config, lengths: Array) -> dict[str, Quantity]:
 def _generated(config: Config) -> Array:
     """Back-EMF under voltage control, expressed as viscous friction (joints,) [N m s/rad].
 
-    The back-EMF constant [V s/rad] equals the torque constant [N m/A] before gear losses. Zero under current control.
+    The back-EMF constant [V s/rad] equals the torque constant [N m/A] before gear losses. The result is zero under
+    current control.
     """
     emf = np.array([joint.joint.servo.torque_per_ampere.value / _GEAR_EFFICIENCY for joint in config.joints])
     per_volt = [joint.torque_per_goal if joint.drive_mode is Mode.PWM else 0.0 for joint in config.joints]

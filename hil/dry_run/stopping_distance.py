@@ -100,8 +100,8 @@ def stopping_distance(config: Config, plan: Plan, ensemble: Ensemble, velocity: 
 
 
 def beyond_when_planned(config: Config, plan: Plan, ensemble: Ensemble) -> dict[Way, Array]:
-    """Largest overshoot beyond the limits (joints,) [rad], by kind of stop, if the planned motion is stopped at any
-    moment.
+    """Largest overshoot beyond the limits (joints,) [rad], by kind of stop, over stops at any moment of the planned
+    motion.
     """
     stops = _Stops(config)
     ways = {
@@ -150,7 +150,7 @@ def _farthest(
 
 
 def _planned_goals(config: Config, plan: Plan) -> Array:
-    """Commanded torque of the whole plan (joints, samples) [N m]; two periods suffice, as further ones repeat them."""
+    """Commanded torque of the whole plan (joints, samples) [N m]; more than two equal periods would add nothing."""
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     parts = []
     for segment in plan.segments:

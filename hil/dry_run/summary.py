@@ -253,8 +253,8 @@ def _stops(config: Config, stopping: Stopping) -> list[str]:
             for index, joint in enumerate(config.joints)
         ]
     lines += [
-        f"If something drives {joint.name} past a limit at these speeds, it overshoots by "
-        f"{_far(passed[Way.BRAKED][index])} when braked, by {_far(passed[Way.CUT][index])} when torque is cut."
+        f"If something drives {joint.name} past a limit at its predicted speed (99 %), the joint overshoots by "
+        f"{_far(passed[Way.BRAKED][index])} when braked and by {_far(passed[Way.CUT][index])} when torque is cut."
         for index, joint in enumerate(config.joints)
     ]
     return [*lines, "Keep that much space clear."]

@@ -41,7 +41,7 @@ noise. The second value is the same quantile for the standard normal distributio
 """
 
 _FEWEST_AT_REST = 30
-"""Minimum number of consecutive readings at one goal from which their noise is measured."""
+"""Minimum number of consecutive readings at a constant goal for measuring their noise."""
 
 _SMALL, _LEAST = 0.5, 0.1
 """Highest and lowest goals that cannot be clipped but are large enough to evaluate, relative to the largest measured
@@ -157,8 +157,8 @@ def _clipped(name: str, goal: Array, measured: Array, margin: float, lower: str)
         return ""
     return (
         f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
-        "high-torque samples. If the reading is right, the servo's own current limit clips it or, at speed, the supply "
-        f"voltage does: lower {lower} or raise the supply voltage."
+        "high-torque samples. If the reading is right, the current is clipped by the servo's own limit or, at speed, "
+        f"by the supply voltage: lower {lower} or raise the supply voltage."
     )
 
 
