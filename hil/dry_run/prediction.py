@@ -99,7 +99,7 @@ class Prediction:
 
     @property
     def limit_chance(self) -> Array:
-        """Probability that a quantity exceeds its limit (quantities, joints); the upper tail is assumed to be normal."""
+        """Probability that a quantity exceeds its limit (quantities, joints), assuming a normal upper tail."""
         middle, spread = self._middle()
         return np.asarray([[0.5 * erfc(z / sqrt(2)) for z in row] for row in ((1 - middle) / spread).tolist()])
 
