@@ -124,7 +124,7 @@ def largest_amplitude(
 def _no_torque(
     config: Config, plan: Plan, ensemble: Ensemble, share: float, pose: Array | None, executor: Executor | None
 ) -> str:
-    """Say which limit of which joint most simulated arms exceed, even at the smallest torque that was tried."""
+    """Say which limit of which joint is exceeded by the most simulated arms at the smallest torque that was tried."""
     prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
     exceeding = (prediction.shares[:, :GUARDED] >= share).sum(axis=0)
     quantity, at = np.unravel_index(int(np.argmax(exceeding)), exceeding.shape)
@@ -139,8 +139,8 @@ def _no_torque(
     return (
         f"{config.path}: no torque was found that keeps the arm within its limits. Even with peak torques of {torque}, "
         f"{exceeding[quantity, at]} of {ensemble.size} simulated arms exceed {part}the {limit} of joint "
-        f"{joint.name!r} ({prediction.limits[quantity, at]:.3g} {unit}). The probability of exceeding any limit is "
-        f"{100 * _chance(prediction, share):.2g} %; safety.limit_chance allows "
+        f"{joint.name!r} ({prediction.limits[quantity, at]:.3g} {unit}). The probability of exceeding {part}any limit "
+        f"is {100 * _chance(prediction, share):.2g} %; safety.limit_chance allows "
         f"{100 * config.safety.limit_chance:.2g} %. Widen that limit, "
         f"{pilot if config.experiment.pilot and config.stabiliser is not None else ''}add values to [arm.prior] so "
         "that the simulated arms differ less, or raise safety.limit_chance."

@@ -28,7 +28,7 @@ from hil.plan.stabiliser import feedback_of
 QUANTITIES = ("lowest position", "highest position", "velocity", "current", "torque", "power")
 UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")
 GUARDED = 3
-"""The guard stops the arm at the limits of the first three quantities. Current is clamped instead; torque and power
+"""The guard stops the arm at the limits of the first GUARDED quantities. Current is clamped instead; torque and power
 follow from the other quantities.
 """
 

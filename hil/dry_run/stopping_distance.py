@@ -302,7 +302,7 @@ class _Stops:
         yield [(start.goal, self._none, _REACTION), (pushed, self._none, NOTICED_AFTER), self._off]
 
     def silent(self, start: _Start) -> Iterator[list[_Piece]]:
-        """Either all servos keep their goals until their watchdogs trip, or one does after the others have been cut."""
+        """All servos keep their goals until their watchdogs trip; or only one does, and the others are cut earlier."""
         kept = (start.goal, self._none, self._heard_for)
         yield [kept, self._off]
         for silent in range(start.goal.size if start.goal.size > 1 else 0):
