@@ -168,7 +168,7 @@ class ArmModel:
         return list(taken.values())
 
     def _inverse(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """Motor torques (joints, ...) [N m]; in the arguments, too, the joints are the first axis."""
+        """Motor torques (joints, ...) [N m]. The joints are also the first axis of the arguments."""
         torque = self._rigid_body(q, dq, ddq)
         for joint, v in enumerate(dq, start=1):
             step = self._step(joint, v)

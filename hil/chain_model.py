@@ -21,8 +21,8 @@ class Geometry:
     """Joint geometry, for all joints in order.
 
     rotation, translation: pose of the joint's frame relative to the previous link's frame at angle zero, (joints, 3, 3)
-    and (joints, 3) [m]. axis: joint axis in its own frame (joints, 3). gravity: gravity in the frame of the base as
-    configured, without any identified tilt (3,) [m/s^2].
+    and (joints, 3) [m]. axis: joint axis in the joint's frame (joints, 3). gravity: configured gravity in the frame of
+    the base (3,) [m/s^2]; an identified tilt is not included.
     """
 
     rotation: Array

@@ -32,8 +32,8 @@ class Trajectory:
     def step(self, goal: float, fastest: float, hardest: float) -> None:
         """Advance by one millisecond towards the goal.
 
-        fastest: velocity limit, 0 to jump to the goal. hardest: acceleration limit, 0 to reach the velocity limit
-        immediately.
+        fastest: velocity limit; with 0, the point jumps to the goal. hardest: acceleration limit; with 0, the velocity
+        changes instantly.
         """
         away = goal - self.position
         before = self.velocity
@@ -57,8 +57,8 @@ class Trajectory:
 def profile(away: float, velocity: int, acceleration: int, time_based: bool) -> tuple[float, float]:
     """Return the velocity limit [ticks/ms] and acceleration limit [ticks/ms^2] for a move of `away` ticks.
 
-    velocity, acceleration: the registers Profile Velocity and Profile Acceleration, which in a time-based profile
-    (Drive Mode bit 2) are the durations of the whole move and of its acceleration [ms].
+    velocity, acceleration: values of the registers Profile Velocity and Profile Acceleration. In a time-based profile
+    (Drive Mode bit 2), they are the durations [ms] of the whole move and of its acceleration phase.
     """
     if not time_based:
         return velocity * VELOCITY_TICKS_PER_MS, acceleration * ACCELERATION_TICKS_PER_MS2

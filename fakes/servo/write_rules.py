@@ -29,7 +29,7 @@ _MULTI_TURN_LIMIT_TICKS = 256 * TICKS_PER_TURN
 def refusal(memory: Memory, model: EmulatedModel, register: Register, value: int, shadow: bool = False) -> int:
     """Return the error number for writing this value to this register; 0 if the write is permitted.
 
-    shadow: the write was addressed to the Secondary ID, which cannot write to the EEPROM.
+    shadow: whether the write was addressed to the Secondary ID; such a write cannot change the EEPROM.
     """
     name = register.name
     if not register.writable or (register.eeprom and (shadow or memory.get("Torque Enable"))):

@@ -1,4 +1,4 @@
-"""The types that the public functions accept as a configuration, kept in a separate module that imports few others."""
+"""The types that the public functions accept as a configuration. This module imports little else."""
 
 from os import PathLike
 from pathlib import Path

@@ -127,7 +127,7 @@ def _from_files(paths: list[Path], config: Path | None, out: PathLikeStr | None)
 
 
 def _discard(folder: Path) -> None:
-    """Remove a folder that holds no result. If it is already gone, the error being handled says so."""
+    """Remove a folder that holds no result. Do nothing if the folder does not exist."""
     if not (folder / "result.json").is_file():
         with suppress(FileNotFoundError):
             for path in folder.iterdir():
@@ -136,7 +136,7 @@ def _discard(folder: Path) -> None:
 
 
 def _again(folder: Path) -> Estimation:
-    """Repeat an earlier estimate of recordings with the configuration in its folder, and write the result there."""
+    """Repeat an earlier estimate of recordings with the configuration in `folder`, and write the result there."""
     record = load_record(folder)
     found = estimate_recordings([Path(file.path) for file in record.files], folder / "config.toml", folder)
     write_recording_report(folder)

@@ -31,7 +31,7 @@ __all__ = ["identify", "record"]
 log = logging.getLogger(__name__)
 
 _UNSETTLED = re.compile("TORQUE|restored|changed during|nother program")
-"""If an error message matches this, the state of the servos must be checked before anything else."""
+"""If an error message matches this pattern, check the state of the servos before anything else."""
 
 
 def identify(

@@ -42,7 +42,7 @@ def unchecked(space: Space) -> Iterator[str]:
 
 
 def near_by_design(space: Space) -> Iterator[str]:
-    """Yield a sentence that lists the pairs of links with parts that need no margin, if there are any."""
+    """Yield one sentence that lists all pairs of links with parts that need no margin; nothing if there are none."""
     if space.near:
         pairs = ", ".join(f"{first} and {second}" for first, second in space.near)
         yield f"Parts of these links are near each other by design; they must not touch, but need no margin: {pairs}."
@@ -75,15 +75,15 @@ def _how_to_compare(config: Config) -> str:
 
 
 def _weak(joint: JointConfig) -> str:
-    """Return a warning if a joint's limit allows no more torque than its servos' typical friction; otherwise ""."""
+    """Return a warning if the limit keeps a joint's torque below its servos' typical friction; otherwise ""."""
     friction = len(joint.ids) * servo_prior(joint.joint.servo).coulomb.median
     torque = joint.goal_limit * joint.torque_per_goal
     if torque > friction:
         return ""
     unit = joint.drive_mode.goal_unit
     return (
-        f"{joint.goal_limit_name} of joint {joint.name!r} = {joint.goal_limit:g} {unit} allows at most {torque:.2g} "
-        f"N m, no more than the typical dry friction of its servos, {friction:.2g} N m. The joint probably would not "
+        f"{joint.goal_limit_name} of joint {joint.name!r} = {joint.goal_limit:g} {unit} limits its torque to "
+        f"{torque:.2g} N m, but its servos' typical dry friction is {friction:.2g} N m. The joint probably would not "
         f"move. It needs about {2.0 * friction / joint.torque_per_goal:.2g} {unit} to move without a load, and more to "
         "lift one."
     )

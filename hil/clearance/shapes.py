@@ -97,7 +97,7 @@ def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule
     along = f"capsule {1e3 * length:.0f} mm long from its joint to {'its end' if is_last else 'the next one'}"
     end = ", and the end is estimated from the centre of mass" if is_last else ""
     return (
-        f'link "{name}": {why}. It is replaced by a {along if length > _NOTHING else "sphere at its joint"}'
+        f'link "{name}": {why}. A {along if length > _NOTHING else "sphere at its joint"} is used instead'
         f"{', in addition to its other shapes' if has_others else ''}. The radius of {1e3 * capsule.radius:.0f} mm is "
         f"a guess{end}, so the clearance to this link is uncertain."
     )
@@ -238,7 +238,7 @@ def _of_shape(shape: ET.Element, arm: ArmDescription) -> list[tuple[Array, float
         low, high = corners.min(axis=0), corners.max(axis=0)
         if (size := float((high - low).max())) > MOST_LENGTH:
             raise UnreadMesh(
-                f'it is {size:.4g} m long: if it is in millimetres, add scale="0.001 0.001 0.001" to its <mesh>'
+                f'it is {size:.4g} m long; if the file is in millimetres, add scale="0.001 0.001 0.001" to its <mesh>'
             )
         return _of_box(0.5 * (low + high), high - low)
     return None
@@ -271,8 +271,8 @@ def _of_box(centre: Array, size: Array) -> list[tuple[Array, float]]:
 def _from_joints(arm: ArmDescription, link: int, fixed: list[Array]) -> list[Capsule]:
     """A capsule from the link's joint to the next one.
 
-    The last link's capsule ends at the farthest frame fixed to it or, if farther, at twice the distance of its centre
-    of mass.
+    The last link's capsule ends at the farthest frame fixed to the link or at twice the distance of its centre of mass,
+    whichever is farther from the joint.
     """
     if link < len(arm.joints):
         end = arm.joints[link].translation
@@ -296,6 +296,6 @@ def _origin(element: ET.Element) -> tuple[Array, Array]:
 
 
 def _numbers(text: str | None, count: int, default: float = float("nan")) -> list[float]:
-    """Parse `count` numbers; return only defaults if there is no text, only NaN if it holds more or fewer numbers."""
+    """Parse `count` numbers. Without text, all are `default`; if the text holds more or fewer, all are NaN."""
     found = [default] * count if text is None else [float(word) for word in text.split()]
     return found if len(found) == count else [float("nan")] * count

@@ -24,7 +24,8 @@ design.
 
 NEAR_SHARE, NEAR_SHARE_OF_OTHERS = 0.75, 0.98
 """Two capsules that are closer than BUILT_NEAR in at least this fraction of random poses are near each other by design:
-they must not touch, but need no margin. The first value applies if one link lies between them, the second if more do.
+they must not touch, but need no margin. The first value applies if there is one link between them, the second if there
+are more.
 """
 
 BUILT_NEAR = 0.02  # m beyond the margin
@@ -129,9 +130,7 @@ class Space:
         return Nearest(float(room[sample]) + needed, needed, self.names_of(int(worst[sample])), sample)
 
     def wrong_rest_pose(self) -> str:
-        """Describe the largest overlap in the rest pose that the excess size of the capsules cannot explain; "" if
-        none.
-        """
+        """Describe the largest overlap in the rest pose; "" if the excess size of the capsules could explain it."""
         found = self.nearest(self.rest[:, None])
         if found.distance >= -AT_REST_INSIDE:
             return ""

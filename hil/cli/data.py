@@ -19,7 +19,7 @@ def compare(
 ) -> None:
     """Apply other methods to a run's recording: RLS, EKF, UKF, IDIM-LS, Zhu et al. (docs/paper.md), mujoco.sysid.
 
-    For a spatial arm, the methods are least squares on Fourier lines, and IDIM-LS.
+    For a spatial arm, the methods are IDIM-LS and least squares on Fourier coefficients.
     """
     from hil.cli.terminal import Terminal
     from hil.estimation.comparison.compare import compare_run

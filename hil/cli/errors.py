@@ -9,7 +9,7 @@ from typer.core import TyperCommand
 from hil.toml_file import shortened
 
 _OF_THE_MACHINE = frozenset({errno.EMFILE, errno.ENFILE})
-"""Operating-system errors that do not depend on the input: too many open files."""
+"""Operating-system errors that do not depend on the input, namely too many open files."""
 
 _OF_A_PATH = frozenset({errno.ENAMETOOLONG, errno.EACCES})
 """Errors that even a check for the existence of a file can raise."""

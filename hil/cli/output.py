@@ -17,7 +17,7 @@ PATIENCE_S = 3.0
 """Time after a signal within which a terminal or pipe must accept some output [s]; otherwise the rest is discarded."""
 
 _PIECE, _POLL_S = 256, 0.1
-"""Number of bytes written at once, so that no write blocks for long, and the interval between two checks [s]."""
+"""Bytes per write (few, so that no write blocks for long), and interval between attempts to write [s]."""
 
 
 def require_output() -> None:

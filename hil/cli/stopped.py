@@ -18,7 +18,7 @@ import typer
 from hil.next_step import next_step
 
 _LOADERS, _LATER_S = frozenset({"importlib", "_frozen_importlib", "numba", "llvmlite"}), 0.02
-"""Packages whose code a signal does not interrupt, and the time after which the signal is repeated [s]."""
+"""A signal does not interrupt the code of these packages; it is sent again after this time [s]."""
 
 
 class Terminated(KeyboardInterrupt):

@@ -35,13 +35,13 @@ _OPTIONS = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable
 
 
 def described_arm(config: "Config") -> ArmDescription:
-    """Read the description in `[arm] urdf` of the arm formed by the configured joints. Raises ArmFileError."""
+    """Read the arm that the configured joints form from the file in `[arm] urdf`. Raises ArmFileError."""
     assert config.arm.urdf is not None
     return _read(config.arm.urdf, tuple(joint.name for joint in config.joints), _changed(config.arm.urdf))
 
 
 def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
-    """Return one sentence per described inertia that no mass distribution can have."""
+    """Return one sentence for each inertia in the description that no real body can have."""
     return tuple(f"{arm.path.name}: {doubt}." for doubt in arm.doubts)
 
 
@@ -81,7 +81,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
 
 
 def doubted_gravity(config: "Config") -> Iterator[str]:
-    """Yield a sentence if the file's gravity differs from the configuration's, which is the one used."""
+    """Yield a sentence if the file's gravity differs from the configured gravity, which takes precedence."""
     arm = described_arm(config)
     if arm.gravity is None or np.abs(np.subtract(arm.gravity, base_gravity(config))).max() <= _SAME_GRAVITY:
         return
@@ -150,7 +150,7 @@ def chain_slips(config: "Config") -> Iterator[str]:
     fake = None if config.fake is None or config.fake.chain is None else Path(config.fake.chain.urdf)
     if fake is not None and fake.name == Path(config.arm.urdf).name and fake != Path(config.arm.urdf):
         yield (
-            f"arm.urdf and fake.chain.urdf are two files with the same name, {fake.name}, and a run folder holds "
+            f"arm.urdf and fake.chain.urdf are different files, but both are named {fake.name}; a run folder must hold "
             "both: rename one"
         )
     if config.experiment.pilot:

@@ -106,7 +106,7 @@ class Columns(Table):
         return None if self.torque_constant is None or self.drive != "current" else list(self.torque_constant)
 
     def without_effect(self, *, in_ticks: bool) -> tuple[str, ...]:
-        """Return the given keys that do not apply to these columns. in_ticks: whether positions are in ticks."""
+        """Return the given keys that have no effect with these columns. in_ticks: whether positions are in ticks."""
         by_voltage = self.drive in {"voltage", "pwm"}
         applies = {
             "time_unit": self.time is not None,

@@ -23,7 +23,7 @@ class ExperimentConfig(Table):
     rate: float = Field(ge=MIN_RATE, le=4000, description="samples per second")
     period: float = Field(gt=0, le=1000, description="s")
     band: Range | None = Field(
-        None, description="Hz: lowest and highest frequency; the lines between are divided among the joints"
+        None, description="Hz: lowest and highest frequency; the harmonics in between are divided among the joints"
     )
     lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
     detection: bool = Field(
@@ -77,7 +77,7 @@ class ExperimentConfig(Table):
         return self
 
     def _meant(self, band: list[float]) -> str:
-        """Name the unit in which a band that is too high for the rate would make sense."""
+        """Suggest a unit in which the band may have been given if it is too high for the rate in Hz."""
         hint = in_other_units(band, "Hz", lambda line: 0.5 / self.period <= line < self.rate / 4)
         return f". {hint}" if hint and band[0] < band[1] else ""
 

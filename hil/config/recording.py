@@ -95,7 +95,7 @@ def parse_recording_config(text: str, path: Path) -> RecordingConfig:
 
 
 def _relevant(values: dict[str, Any]) -> dict[str, Any]:
-    """The values without the tables and keys that only an experiment needs; unknown ones remain."""
+    """The values without the tables and keys that only an experiment needs; unknown tables and keys remain."""
     kept = _without(values, RecordingConfig, Config)
     if isinstance(kept.get("arm"), dict):
         kept["arm"] = _without(kept["arm"], ArmFacts, ArmConfig)
@@ -110,7 +110,7 @@ def _without(table: dict[str, Any], used: type[BaseModel], known: type[BaseModel
 
 
 def _with_urdf_beside(values: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the tables; arm.urdf, if relative, is resolved against the TOML file's folder."""
+    """Return the tables, with a relative arm.urdf resolved against the TOML file's folder."""
     arm = values.get("arm")
     if isinstance(arm, dict) and isinstance(arm.get("urdf"), str):
         return {**values, "arm": {**arm, "urdf": str(path.parent / arm["urdf"])}}

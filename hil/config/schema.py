@@ -153,7 +153,7 @@ class SafetyConfig(Table):
         0.6, le=5, description="rad/s, speed at which a stop lowers a spatial arm to its rest pose"
     )
     lower_time: PositiveFloat = Field(
-        10.0, le=60, description="s, maximum duration of lowering, for which lower_speed is exceeded if necessary"
+        10.0, le=60, description="s, time limit for lowering; lower_speed is exceeded if necessary to meet it"
     )
     limit_chance: float = Field(
         0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"
@@ -230,7 +230,7 @@ class Config(Table):
             _same_length("experiment.lines", self.experiment.lines, count)
             excited = [line for lines in self.experiment.lines for line in lines]
             if len(set(excited)) != len(excited):
-                raise ValueError("experiment.lines: two joints share a line; each line may belong to one joint only")
+                raise ValueError("experiment.lines: two joints share a harmonic; each joint needs its own harmonics")
         self._check_band()
         _all_different("id", [servo_id for joint in self.joints for servo_id in joint.ids])
         _all_different("name", [joint.name for joint in self.joints])
@@ -286,7 +286,7 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is spatial: [arm] urdf is given, and [joint_path] is given or that arm is not planar."""
+        """Whether the arm is spatial: a description is given that is not planar, or is used with a [joint_path]."""
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property
@@ -332,7 +332,9 @@ def load_config(path: str | PathLike[str]) -> Config:
         raise ConfigError(f"{shortened(str(path))}: {error.strerror}.") from error
     if is_folder:
         if path == Path():
-            raise ConfigError(". cannot be read: it is the current folder (as is an empty name). Name a TOML file.")
+            raise ConfigError(
+                ". cannot be read: it is the current folder (an empty name means the same). Name a TOML file."
+            )
         within = [*path.glob("*.toml")]
         hint = f"; did you mean {within[0]}?" if len(within) == 1 else ". Name a TOML file."
         raise ConfigError(f"{path} cannot be read: it is a folder{hint}")
@@ -424,8 +426,8 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
 def port_url(port: str) -> str:
     """The URL of a port.
 
-    `port` is a URL or device, which is returned unchanged; a TOML file; or the name of a fake arm for other programs
-    (`koch`) or, if there is none, of a bundled configuration. Raises ConfigError.
+    `port` can be a URL or a device, which is returned unchanged; a TOML file; the name of a fake arm for other programs
+    (`koch`); or, if no such arm exists, the name of a bundled configuration. Raises ConfigError.
     """
     url = _url_of(port)
     fakes.register_for(url)

@@ -97,8 +97,8 @@ class ArmJoint:
     fixed: tuple[str, ...]
     """Names of the links attached to this joint's link by fixed or held joints."""
     movable: Mapping[str, Body] = field(default_factory=dict)
-    """Bodies, by name, of those links in `fixed` that are moved by held joints, in the frame of this joint's link. Each
-    body excludes the links attached to it.
+    """The links in `fixed` that held joints move: their bodies by link name, in the frame of this joint's link. A body
+    does not include the links attached to it.
     """
 
 

@@ -1,5 +1,5 @@
-"""Serial arms from MJCF, as MuJoCo itself reads it, including defaults, included files and inertias derived from
-shapes.
+"""Read serial arms from MJCF files, using MuJoCo's own parser, which also handles defaults, included files and inertias
+derived from shapes.
 """
 
 import importlib
@@ -174,8 +174,8 @@ class _Tree:
             if before not in (WORLD, *self._way(body)) or loose:
                 where = self.name(loose[0]) if loose else name
                 raise ArmFileError(
-                    f'{self.path}: a joint before "{name}", at "{where}", is not among the arm\'s joints: name '
-                    "all of them, in order from the base"
+                    f'{self.path}: a joint before "{name}" (at "{where}") is not among the arm\'s joints: name '
+                    "all joints, in order from the base"
                 )
         return moved
 
@@ -203,13 +203,14 @@ class _Tree:
             kind = int(self.model.eq_type[index])
             if kind in LOOPS:
                 raise ArmFileError(
-                    f"{self.path}: an equality {LOOPS[kind]} closes a loop, which a serial arm does not have: remove it"
+                    f"{self.path}: the equality constraint <{LOOPS[kind]}> closes a loop, which a serial arm does not "
+                    "have: remove it"
                 )
             joint = int(self.model.eq_obj1id[index])
             if kind == COUPLED and self.model.joint(joint).name in names:
                 raise ArmFileError(
-                    f'{self.path}: joint "{self.model.joint(joint).name}" is coupled to another by an equality, so it '
-                    "has no motor of its own: leave it out"
+                    f'{self.path}: joint "{self.model.joint(joint).name}" is coupled to another by an equality '
+                    "constraint, so it has no motor of its own: leave it out"
                 )
 
     def _way(self, body: int) -> list[int]:
@@ -221,8 +222,8 @@ class _Tree:
         return way
 
     def frame(self, body: int, before: int) -> tuple[Array, Array]:
-        """Rotation and position of a body's joint in the frame of the previous moving body, whose origin is its
-        joint.
+        """Rotation and position of a body's joint in the frame of the previous moving body. That frame's origin is the
+        previous joint.
         """
         rotation, translation = np.eye(3), np.zeros(3)
         for part in self._way(body):

@@ -32,7 +32,7 @@ def moves(arm: ArmDescription, angles: Array, joint: int, up: Array | tuple[floa
     velocity, up = np.cross(direction, end_point(arm, angles) - place), np.asarray(up)
     if float(np.linalg.norm(velocity)) < LEAST_LEVER:
         axis = _towards(direction, up)
-        return f"turns the end about its own axis, which points {axis}, counter-clockwise as seen from that side"
+        return f"turns the end about its own axis (pointing {axis}), counter-clockwise as seen from that side"
     return f"moves the end {_towards(velocity, up)}"
 
 

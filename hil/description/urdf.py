@@ -258,7 +258,7 @@ def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) ->
     if not names:
         raise ArmFileError(f"{path}: no joint rotates, so it does not describe an arm")
     if len(set(names)) < len(names):
-        raise ArmFileError(f"{path}: joints {', '.join(names)}: one is named twice")
+        raise ArmFileError(f"{path}: in the list of joints ({', '.join(names)}), one is named twice")
     for name in names:
         if name not in tree:
             turning = [joint.name for joint in tree.values() if joint.kind in TURNING]
@@ -349,8 +349,8 @@ def check_units(arm: Sequence[ArmJoint], path: Path) -> None:
         if body.mass > MOST_MASS or gyration > MOST_GYRATION or np.linalg.norm(body.centre) > MOST_LENGTH:
             raise ArmFileError(
                 f'{path}: link "{joint.link}" has a mass of {body.mass:.4g} kg at {np.linalg.norm(body.centre):.4g} m '
-                f"from its joint, and a radius of gyration of {gyration:.4g} m: are these grams or mm? URDF uses "
-                "metres, kilograms and kg m^2"
+                f"from its joint, and a radius of gyration of {gyration:.4g} m: are these values in g or mm? "
+                "URDF uses metres, kilograms and kg m^2"
             )
 
 

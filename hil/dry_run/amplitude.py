@@ -47,8 +47,8 @@ class AmplitudeOptions:
     polishing_ratio: float = 1.06
     """Factor by which each of the final increases raises a joint's torque."""
     worst_arms: int = 4
-    """After a failed check, the next one starts with the worst arms: the number allowed to exceed a limit, plus this
-    many.
+    """After a failed check, the next check starts with the worst arms: as many as may exceed a limit, plus this
+    number.
     """
     back_off: float = 0.93
     """Factor applied to the torque when the check on all arms has failed."""
@@ -124,7 +124,7 @@ def largest_amplitude(
 def _no_torque(
     config: Config, plan: Plan, ensemble: Ensemble, share: float, pose: Array | None, executor: Executor | None
 ) -> str:
-    """Describe the limit, and its joint, that the most simulated arms exceed at the smallest torque that was tried."""
+    """Say which limit of which joint is exceeded by the most simulated arms at the smallest torque that was tried."""
     prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
     exceeding = (prediction.shares[:, :GUARDED] >= share).sum(axis=0)
     quantity, at = np.unravel_index(int(np.argmax(exceeding)), exceeding.shape)
@@ -139,8 +139,8 @@ def _no_torque(
     return (
         f"{config.path}: no torque was found that keeps the arm within its limits. Even with peak torques of {torque}, "
         f"{exceeding[quantity, at]} of {ensemble.size} simulated arms exceed {part}the {limit} of joint "
-        f"{joint.name!r} ({prediction.limits[quantity, at]:.3g} {unit}). The probability of doing so at any limit is "
-        f"{100 * _chance(prediction, share):.2g} %; safety.limit_chance allows "
+        f"{joint.name!r} ({prediction.limits[quantity, at]:.3g} {unit}). The probability of exceeding {part}any limit "
+        f"is {100 * _chance(prediction, share):.2g} %; safety.limit_chance allows "
         f"{100 * config.safety.limit_chance:.2g} %. Widen that limit, "
         f"{pilot if config.experiment.pilot and config.stabiliser is not None else ''}add values to [arm.prior] so "
         "that the simulated arms differ less, or raise safety.limit_chance."
@@ -192,8 +192,8 @@ def _search(
 def _polished(
     reached_with: Callable[[Array], Array], torque: Array, reached: Array, most: Array, options: AmplitudeOptions
 ) -> Array:
-    """Raise, in small steps, the torque of the joint that uses the least of its range, while all joints stay within
-    limits.
+    """In small steps, raise the torque of the joint that uses the least of its range, as long as all joints stay within
+    their limits.
 
     reached: fraction of the allowed range that each joint uses with `torque`.
     """
@@ -214,7 +214,7 @@ def _polished(
 
 
 def _reached(config: Config, prediction: Prediction, share: float) -> Array:
-    """Fraction of its allowed range that each joint uses (joints,): the worst arm's, or the predicted one if that is
+    """Fraction of its allowed range that each joint uses (joints,): the worst arm's or the predicted one, whichever is
     larger.
     """
     return np.asarray(prediction.shares_with(config.safety.limit_chance)[:GUARDED].max(axis=0) / share)

@@ -119,8 +119,8 @@ def simulated_seconds(plan: Plan) -> float:
 
 
 def loop_of(config: Config, segment: PathSegment, rate: float, stops: Array | None = None) -> Loop:
-    """Commands and feedback of the control loop during a segment. stops: the side on which each joint lies on its own
-    stop, as in `Loop`.
+    """Commands and feedback of the control loop during a segment. stops: the stop against which each joint rests, as in
+    `Loop`.
     """
     assert config.stabiliser is not None  # checked with the configuration
     constants = np.array([joint.torque_per_goal for joint in config.joints])

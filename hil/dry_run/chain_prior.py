@@ -69,7 +69,7 @@ def _links(random: np.random.Generator, described: Array, count: int, spread: fl
 
 
 def _drives(config: Config, given: PriorConfig) -> dict[str, tuple[Array, Array]]:
-    """Medians and relative spreads of friction, lag, armature, and the fraction of viscous friction due to back-EMF.
+    """Medians and relative spreads of friction, lag, armature and the share of viscous friction caused by back-EMF.
 
     Friction and armature are multiplied by the number of servos on the joint.
     """

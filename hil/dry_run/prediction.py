@@ -28,7 +28,7 @@ from hil.plan.stabiliser import feedback_of
 QUANTITIES = ("lowest position", "highest position", "velocity", "current", "torque", "power")
 UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")
 GUARDED = 3
-"""Number of leading quantities at whose limits the guard stops the arm. Current is clamped instead; torque and power
+"""The guard stops the arm at the limits of the first GUARDED quantities. Current is clamped instead; torque and power
 follow from the other quantities.
 """
 
@@ -43,10 +43,10 @@ class Prediction:
     """The prediction of a dry run.
 
     values: extreme values of every arm (arms, quantities, joints), in the order of QUANTITIES and in UNITS. shares: the
-    same as fractions of the distance from rest to the limit. limits: limits (quantities, joints). settled_after: number
-    of periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over time
-    of a few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: samples per
-    second [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at rest or centre,
+    same values as fractions of the distance from rest to the limit. limits: limits (quantities, joints). settled_after:
+    number of periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over
+    time of a few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: sampling
+    rate [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at rest or centre,
     whichever is farther from that limit.
     """
 
@@ -99,7 +99,7 @@ class Prediction:
 
     @property
     def limit_chance(self) -> Array:
-        """Probability that a quantity exceeds its limit (quantities, joints), with a normal tail above the median."""
+        """Probability that a quantity exceeds its limit (quantities, joints), assuming a normal upper tail."""
         middle, spread = self._middle()
         return np.asarray([[0.5 * erfc(z / sqrt(2)) for z in row] for row in ((1 - middle) / spread).tolist()])
 

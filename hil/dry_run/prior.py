@@ -54,8 +54,8 @@ def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
     if lengths is None:
         raise ConfigError(
             f"{config.path}: the effect of a torque on this arm cannot be predicted without its link lengths. Measure "
-            "from joint to joint and to the tip with a ruler, and set arm.link_lengths = [...] in m, one for each of "
-            "[[joints]]; or use an earlier identification in the dry run (--result)."
+            "from joint to joint and to the tip with a ruler, and set arm.link_lengths = [...] in m, one per "
+            "[[joints]] table; or use an earlier identification in the dry run (--result)."
         )
     random = np.random.default_rng((seed, 5))
     drawn = {name: quantity.draw(random, count) for name, quantity in quantities(config, np.array(lengths)).items()}
@@ -109,7 +109,8 @@ def quantities(config: Config, lengths: Array) -> dict[str, Quantity]:
 def _generated(config: Config) -> Array:
     """Back-EMF under voltage control, expressed as viscous friction (joints,) [N m s/rad].
 
-    The back-EMF constant [V s/rad] equals the torque constant [N m/A] before gear losses. Zero under current control.
+    The back-EMF constant [V s/rad] equals the torque constant [N m/A] before gear losses. The result is zero under
+    current control.
     """
     emf = np.array([joint.joint.servo.torque_per_ampere.value / _GEAR_EFFICIENCY for joint in config.joints])
     per_volt = [joint.torque_per_goal if joint.drive_mode is Mode.PWM else 0.0 for joint in config.joints]

@@ -1,7 +1,7 @@
-"""Infer which joints of a spatial arm lie on their own mechanical stops in the rest pose.
+"""Infer which joints of a spatial arm rest against their own mechanical stops in the rest pose.
 
 In the rest pose an arm is supported by a surface (floor, cradle, another link) or by the joints' own stops. Moving the
-arm can lift it off a surface; a stop holds its joint whatever the angles of the others.
+arm can lift it off a surface, but a stop holds its joint regardless of the other joints' angles.
 """
 
 from collections.abc import Sequence
@@ -18,20 +18,20 @@ from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan
 
 NEAR_STOP_RAD = 0.14
-"""A joint that lies on its stop is at most this far from the end of its range, as configured or described [rad]."""
+"""A joint that rests against a stop is at most this far from the end of its configured or described range [rad]."""
 
 
 PASSED_RAD = 0.05
-"""A joint that has been this far [rad] beyond its rest pose does not lie on a stop there: no stop yields that much."""
+"""A joint that has been this far [rad] beyond its rest pose has no stop there: no stop yields that much."""
 
 
 def resting_stops(config: Config, arms: ChainArms, planned: Sequence[Array] = (), passed: Mask | None = None) -> Array:
-    """Side on which each joint lies on its stop (joints,): -1 at its smallest angle, 1 at its largest, 0 if on neither.
+    """The stop against which each joint rests (joints,): -1 at its smallest angle, 1 at its largest, 0 for neither.
 
-    A joint is assumed to lie on its stop if its rest pose is near the end of its range, nothing else touches the part
-    of the arm that it moves, and gravity does not pull it away from there. This assumption is dropped if a recording
-    shows the joint beyond its rest pose, or if a planned path takes it there, within its configured limits. planned:
-    positions of these paths, each (joints, samples) [rad]. passed: whether each joint has been below and above its rest
+    A joint is assumed to rest against a stop if its rest pose is near the end of its range, nothing else touches the
+    part of the arm that it moves, and gravity does not pull it away from the stop. This assumption is dropped if a
+    recording or a planned path takes the joint beyond its rest pose, within its configured limits. planned: positions
+    of the planned paths, each (joints, samples) [rad]. passed: whether each joint has been below and above its rest
     pose, as returned by `passed_rest` (2, joints). Raises ArmFileError.
     """
     rest = np.array(config.arm.rest_pose)
@@ -61,7 +61,7 @@ def planned_paths(plan: Plan) -> list[Array]:
 
 
 def said_of_stops(config: Config, side: Array) -> str:
-    """State which joints are assumed to lie on their own stops, and what happens if they do not; "" if none are."""
+    """Say which joints are assumed to rest against their own stops, and what happens if they do not; "" if none."""
     found = []
     for joint, each, rest in zip(config.joints, side.tolist(), config.arm.rest_pose, strict=True):
         if each:
@@ -70,9 +70,9 @@ def said_of_stops(config: Config, side: Array) -> str:
     if not found:
         return ""
     return (
-        "Nothing in the description supports these joints in the rest pose, so each is assumed to lie on its own "
-        f"mechanical stop: {', '.join(found)}. If something else supports them, name it in [clearance] (floor, boxes). "
-        "Otherwise they may sag by up to the angle in brackets before position_limit stops the arm."
+        "Nothing in the description supports these joints in the rest pose, so each is assumed to rest against its "
+        f"own mechanical stop: {', '.join(found)}. If something else supports them, name it in [clearance] (floor, "
+        "boxes). Otherwise they may sag by up to the angle in brackets before position_limit stops the arm."
     )
 
 

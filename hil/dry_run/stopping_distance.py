@@ -44,7 +44,7 @@ overshoot.
 _EVENLY = 16
 _IMMOVABLE = 1e3  # kg m^2
 _JUDGED_AFTER_S = (0.05, 0.2, 0.5)
-"""Times after torque is cut at which a simulation ends if the arm has too little energy to exceed its limits [s]."""
+"""Times after torque is cut at which a simulation ends if the arm's energy is too low to exceed its limits [s]."""
 _REACTION = 2
 """Number of samples before the stop takes effect: the sample that shows the fault, and the one in progress."""
 
@@ -100,8 +100,8 @@ def stopping_distance(config: Config, plan: Plan, ensemble: Ensemble, velocity: 
 
 
 def beyond_when_planned(config: Config, plan: Plan, ensemble: Ensemble) -> dict[Way, Array]:
-    """Largest overshoot beyond the limits (joints,) [rad], by kind of stop, if the planned motion is stopped at any
-    moment.
+    """Largest overshoot beyond the limits (joints,) [rad], by kind of stop, over stops at any moment of the planned
+    motion.
     """
     stops = _Stops(config)
     ways = {
@@ -150,7 +150,7 @@ def _farthest(
 
 
 def _planned_goals(config: Config, plan: Plan) -> Array:
-    """Commanded torque of the whole plan (joints, samples) [N m]; two periods suffice, as further ones repeat them."""
+    """Commanded torque of the whole plan (joints, samples) [N m]; more than two equal periods would add nothing."""
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     parts = []
     for segment in plan.segments:
@@ -159,7 +159,7 @@ def _planned_goals(config: Config, plan: Plan) -> Array:
 
 
 def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array) -> list[_Start]:
-    """States of the planned motion up to a limit: those expected to overshoot most, and evenly spaced ones."""
+    """States of the planned motion before it reaches a limit: some evenly spaced, others likely to overshoot most."""
     rest = resting(np.array(config.arm.rest_pose))
     moved = respond(physics, rest, goals * scale[:, None], config.experiment.rate, _felt(config, scale), COARSE)
     until = _within_limits(config, moved)
@@ -302,7 +302,7 @@ class _Stops:
         yield [(start.goal, self._none, _REACTION), (pushed, self._none, NOTICED_AFTER), self._off]
 
     def silent(self, start: _Start) -> Iterator[list[_Piece]]:
-        """All servos keep their goals until their watchdogs trip, or one does while the others are cut earlier."""
+        """All servos keep their goals until their watchdogs trip; or only one does, and the others are cut earlier."""
         kept = (start.goal, self._none, self._heard_for)
         yield [kept, self._off]
         for silent in range(start.goal.size if start.goal.size > 1 else 0):

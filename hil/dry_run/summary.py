@@ -24,8 +24,8 @@ class FirstRun:
     """The first run of a pilot.
 
     peak_torque: peak torques (joints,) [N m]. prediction: peaks of the simulated arms, with the limits of that run.
-    played: its configuration. If the arm needs a stabiliser, it contains the proposed one; if no torque is safe over
-    the whole range, its position limits are closer to the rest pose.
+    played: configuration of that run. It contains the proposed stabiliser if the arm needs one; if no torque is safe
+    over the whole range, its position limits are closer to the rest pose.
     """
 
     peak_torque: Array
@@ -58,7 +58,7 @@ class DryRun:
 
     @property
     def shown(self) -> Prediction:
-        """The prediction for the configured torque or, without one, for the largest safe torque or the first run."""
+        """The prediction for the configured torque; if none is set, for the largest safe torque or the first run."""
         if self.asked is not None:
             return self.asked
         if self.largest is not None:
@@ -257,8 +257,8 @@ def _stops(config: Config, stopping: Stopping) -> list[str]:
             for index, joint in enumerate(config.joints)
         ]
     lines += [
-        f"If something drives {joint.name} past a limit at these speeds, it overshoots by "
-        f"{_far(passed[Way.BRAKED][index])} when braked, by {_far(passed[Way.CUT][index])} when torque is cut."
+        f"If something drives {joint.name} past a limit at its predicted speed (99 %), the joint overshoots by "
+        f"{_far(passed[Way.BRAKED][index])} when braked and by {_far(passed[Way.CUT][index])} when torque is cut."
         for index, joint in enumerate(config.joints)
     ]
     return [*lines, "Keep that much space clear."]

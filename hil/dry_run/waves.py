@@ -24,7 +24,7 @@ def roomy_plan(config: Config, physics: Physics) -> Plan:
     """The configured plan, with the variant of each multisine that uses the largest part of the arm's position range.
     physics: parameters of the arm.
 
-    Reversing the sign or time of a wave gives another wave with the same lines and peaks.
+    Reversing the sign or time of a wave gives another wave with the same spectrum and peaks.
     """
     return roomy_plans(config, physics, 1)[0]
 
@@ -46,7 +46,7 @@ def _variants(config: Config, problem: DesignProblem, segment: Segment) -> list[
 
 
 def _evenness(problem: DesignProblem, wave: Multisine) -> float:
-    """Covered range relative to the largest one possible within the limits, for the worse joint; 1 is ideal."""
+    """Range covered by the motion, relative to the largest one within the limits, for the worse joint; 1 is ideal."""
     ones = np.ones((1, wave.joints))
     arms = ManyArms([problem.physics], ones, problem.pose[None], problem.feedback)
     position = arms.positions(np.tile(wave.torque, 2), wave.rate, _EVERY)[0]

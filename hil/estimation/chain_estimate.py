@@ -73,7 +73,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     currents = settled_current_findings(config, samples)
     truth, extra = true_chain_parameters(config, known), quantities(estimate, linear, len(estimate.names))
     result = SettledResult(
-        method="settled period, least squares on Fourier lines, then maximum likelihood of one-step-ahead "
+        method="settled period, least squares on Fourier coefficients, then maximum likelihood of one-step-ahead "
         f"position predictions with an observer of {estimate.softness:g} Hz; {model.description}",
         config=facts.config,
         joints=len(config.joints),

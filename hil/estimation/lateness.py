@@ -36,6 +36,6 @@ def acting_torque(goals: Array, late: Array, rate: float) -> Array:
 
 
 def velocity_of(period: SettledPeriod) -> Array:
-    """Velocities (joints, samples) [rad/s] from the Fourier lines of the motion that lie above the noise."""
+    """Velocities (joints, samples) [rad/s] from those Fourier coefficients of the motion that exceed the noise."""
     lines = lines_of(period.filled())
     return motion_of(lines, cut_off(lines), period.fundamental, period.samples).velocity

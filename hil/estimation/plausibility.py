@@ -53,8 +53,8 @@ def wrong_length(length: float | None, gravity: float, estimate: Estimate | Shoo
     if not abs(found - length) > max(DEVIATIONS * std, LENGTH_TOLERANCE * length):
         return []
     return [
-        f"coupling * gravity / gravity_2 = {found:.3g} +- {std:.1g} m should be the length of link 1, {length:.3g} m: "
-        "arm.gravity, the plane's tilt or that length is wrong, or the model is incomplete."
+        f"coupling * gravity / gravity_2 = {found:.3g} +- {std:.1g} m should equal the length of link 1, {length:.3g} "
+        "m: arm.gravity, the plane's tilt or that length is wrong, or the model is incomplete."
     ]
 
 

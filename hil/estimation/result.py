@@ -38,7 +38,7 @@ def make_result(
     base = len(estimate.model.base_names)
     truth, extra = true_parameters(config, mean_time), quantities(estimate, base, len(estimate.names))
     return SettledResult(
-        method=f"settled period, least squares on Fourier lines, then maximum likelihood; "
+        method=f"settled period, least squares on Fourier coefficients, then maximum likelihood; "
         f"{estimate.model.friction} friction, {estimate.model.drive} drive",
         config=shown_path,
         joints=len(config.joints),

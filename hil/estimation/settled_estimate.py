@@ -156,8 +156,8 @@ def _torque_instead(other: SettledPeriod | None, estimate: Estimate, drift: Drif
 
 
 def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift | None, is_corrected: bool) -> PlayedPeriod:
-    """Predict the held-out period with the friction that the arm had then. is_corrected: whether to correct the
-    prediction for friction that changes within the period, as for the fitted period.
+    """Predict the held-out period with the friction that the arm had during that period. is_corrected: whether to
+    correct the prediction for friction that changes within the period, as for the fitted period.
     """
     if drift is None:
         return PlayedPeriod(other.rate, other.torque, other.position, predict_period(estimate, other))
@@ -198,7 +198,7 @@ def _estimate(
     starts: list[dict[str, float]],
     executor: Executor | None,
 ) -> tuple[Estimate, Choice | None]:
-    """Fit the configured model (the choice is then None) or, if its friction is "auto", choose one."""
+    """Fit the configured model. If its friction is "auto", choose among models; otherwise the Choice is None."""
     wanted, by_voltage, lever = config.model, voltage_driven(config), lever_of(config)
     if wanted.friction == "auto":
         choice = choose(

@@ -20,8 +20,8 @@ from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
 
 _AROUND_S, _FEWEST_AROUND = 0.04, 4
-"""Time [s] before and after a sample within which readings determine its velocity, and minimum number of readings on
-each side.
+"""A sample's velocity is determined from readings within this time before and after it [s], at least this many on each
+side.
 """
 
 
@@ -47,7 +47,7 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
             f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole "
             + ("period" if whole == 1 else "periods")
             + (
-                f": it ended too early. {wanted} periods, {wanted * count} samples, are needed. Record again."
+                f": it ended too early. {wanted} periods ({wanted * count} samples) are needed. Record again."
                 if whole < wanted
                 else f", in which the motion did not become periodic to within experiment.settle_within = "
                 f"{experiment.settle_within:g} for {experiment.periods} periods. Record again, for longer."
@@ -122,7 +122,7 @@ def _torque_constants(config: Config) -> Array:
 
 
 def _stabilised(config: Config, rows: NDArray[np.void], torque: Array, first: int) -> Stabilised:
-    """Separate the stabiliser's contribution from `torque` (joints, samples) [N m]; first: its first row."""
+    """Separate the stabiliser's contribution from `torque` (joints, samples) [N m], which starts at row `first`."""
     with_former = rows[first - 1 : first + torque.shape[1]]
     given = np.nan_to_num(feedback_torque(config, with_former)).T
     excitation = _by_period(torque - given, config.experiment.samples).mean(axis=0)

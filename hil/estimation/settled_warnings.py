@@ -26,7 +26,7 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
         steps = swing / facts.position_step[index]
         if steps < LEAST_SWING:
             found.append(
-                f"{joint.name} moved by only {steps:.0f} encoder steps: rounding errors dominate its parameters; "
+                f"{joint.name} moved by only {steps:.0f} encoder steps, so rounding errors dominate its parameters; "
                 f"raise {torque_limit(config, samples, index) or 'its peak_torque'}."
             )
         lost = 1.0 - float(np.mean(period.valid[index]))
@@ -36,7 +36,7 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
                 f"this computer was late for {100 * late:.1f} % of the samples: close other programs, or lower "
                 "experiment.rate."
                 if late > BY_LATENESS * lost
-                else "check cable, baud rate and sampling rate."
+                else "check the cable, the baud rate and the sampling rate."
             )
             found.append(
                 f"{joint.name}: {100 * lost:.1f} % of the samples are missing or far from their neighbours; {remedy}"

@@ -9,7 +9,7 @@ _T = TypeVar("_T")
 
 
 def answer(question: str, usual: str) -> str:
-    """Return the answer to a question, `usual` if it is empty. Raises BadParameter if there is nobody to answer."""
+    """Return the answer to a question, or `usual` if it is empty. Raises BadParameter if nobody can answer."""
     asked: str = _put(
         lambda: typer.prompt(question, default=usual, show_default=bool(usual), err=True),
         "Add --yes to accept every default.",
@@ -18,7 +18,7 @@ def answer(question: str, usual: str) -> str:
 
 
 def agrees(question: str) -> bool:
-    """Return whether the answer to a question is yes. Raises BadParameter if there is nobody to answer."""
+    """Ask a yes-or-no question; return whether the answer is yes. Raises BadParameter if nobody can answer."""
     return _put(lambda: typer.confirm(question), "Add --yes to answer yes to every question.")
 
 

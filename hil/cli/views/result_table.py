@@ -57,11 +57,11 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
     if result.model_choice is not None:
         choice = result.model_choice
         compared = (
-            "the simplest model"
+            ", the simplest model"
             if choice.chosen == choice.plainest
-            else f"whose error, compared with the simplest model's, is {_times(_inverse(choice.error_divided_by))}"
+            else f". Compared with the simplest model, its error is {_times(_inverse(choice.error_divided_by))}"
         )
-        print(f"Chosen on held-out segments: {choice.chosen}, {compared}.")
+        print(f"Chosen on held-out segments: {choice.chosen}{compared}.")
     if result.physical is not None:
         print("\n".join(physical_lines(result.physical)))
     for note in result.notes:

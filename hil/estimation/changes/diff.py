@@ -80,7 +80,7 @@ class Difference:
         reservation.
         """
         untrusted = tuple(
-            f'The report of {name} says "trust this model: {trust}" and explains why: the values may be biased '
+            f'The report of {name} says "trust this model: {trust}" and explains why. The values may be biased '
             "by more than their standard errors, so a change may come from the model instead of the arm."
             for name, trust in zip((self.before, self.after), self.trust, strict=True)
             if trust not in (None, "yes")

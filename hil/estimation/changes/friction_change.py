@@ -26,8 +26,8 @@ from hil.estimator.models.terms import TERMS
 from hil.results.parts import Covariance
 
 KINDS = ("viscous", "coulomb", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry")
-"""Terms of sliding friction, and the width of the Coulomb step, which the data determine only together with the
-Stribeck rise.
+"""Terms of sliding friction. They include the width of the Coulomb step: the data determine this width only together
+with the Stribeck rise.
 """
 REPEATABILITY = 0.005
 """Run-to-run standard deviation of a friction parameter of an unchanged arm, relative to its value."""

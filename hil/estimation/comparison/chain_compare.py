@@ -78,7 +78,7 @@ class Judge:
 def worst_chain_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
     """Return the base parameter or friction term with the largest relative error, and that error.
 
-    Offsets are left out, and so are sums that are small compared with others of their kind (see LARGE).
+    Offsets are left out, and so are parameters that are small compared with others of the same kind (see LARGE).
     """
     kinds = {name: name.partition("_")[0] for name in truth if not name.startswith(("offset", "base_tilt"))}
     largest = {kind: max(abs(truth[name]) for name in kinds if kinds[name] == kind) for kind in set(kinds.values())}
@@ -103,7 +103,7 @@ def _methods(config: Config, period: SettledPeriod, judge: Judge) -> Iterator[Pe
     began = time.perf_counter()
     linear = fit_lines([period], model, prior)
     seconds = time.perf_counter() - began
-    words = "first stage alone: least squares on the period's Fourier lines"
+    words = "first stage alone: least squares on the period's Fourier coefficients"
     yield Peer(
         "fourier_lines", _simulated(model, linear.value), _by_name(model.linear_names, linear.std), seconds, words, 1
     )

@@ -3,7 +3,7 @@
 The arm is a MuJoCo model with one or two hinges. The unknowns are the first moment and inertia of each link, the
 armature of joint 2, and each joint's damping, friction loss and constant torque, all scaled by expected values. The
 method is given every advantage: an initial guess within 50 % of the expected values (from farther away, it does not
-converge), the length of link 1, the initial state from the period's Fourier lines, the delay found by hil's stage 1,
+converge), the length of link 1, the initial state from the period's Fourier series, the delay found by hil's stage 1,
 and mujoco.sysid's own optimiser with rollouts on all cores.
 """
 

@@ -28,8 +28,8 @@ _RECENT = 4
 
 _BEYOND, _BEYOND_OFTEN = 0.25, 0.02
 """A current counts as different from the commanded one if it is outside the range spanned by 0 and all recent goals by
-more than its noise and this fraction of the largest goal. A warning is given if the fraction of such samples exceeds
-the second value.
+more than its noise and by more than this fraction of the largest goal. A warning is given if the fraction of such
+samples exceeds the second value.
 """
 
 _SIGMAS = 3.0
@@ -37,11 +37,11 @@ _SIGMAS = 3.0
 
 _QUANTILE, _OF_NORMAL = 0.25, 0.3186
 """Noise is estimated from this quantile of its magnitude, because goals that are altered now and then must not count as
-noise; the second value is that of the standard normal distribution.
+noise. The second value is the same quantile for the standard normal distribution.
 """
 
 _FEWEST_AT_REST = 30
-"""Minimum number of consecutive readings at one goal from which their noise is measured."""
+"""Minimum number of consecutive readings at a constant goal for measuring their noise."""
 
 _SMALL, _LEAST = 0.5, 0.1
 """Highest and lowest goals that cannot be clipped but are large enough to evaluate, relative to the largest measured
@@ -98,10 +98,11 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
 
 
 def _noise(goal: Array, measured: Array) -> float:
-    """Standard deviation of a current reading, estimated from the recording as the larger of two values: its scatter at
-    constant goals, and its deviation from the goals or, if smaller, the second difference of that deviation.
+    """Standard deviation of a current reading, estimated from the recording.
 
-    Since the current may lag the goal by a few samples, the lag that leaves the smallest deviation is used.
+    It is the larger of two values: the scatter at constant goals, and the scatter of the deviation from the goals (or
+    of that deviation's second difference, if smaller). Since the current may lag the goal by a few samples, the lag
+    that leaves the smallest deviation is used.
     """
     count = len(goal) - _RECENT
     if count < _RECENT:
@@ -156,13 +157,13 @@ def _clipped(name: str, goal: Array, measured: Array, margin: float, lower: str)
         return ""
     return (
         f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
-        "high-torque samples. If the reading is right, the servo's own current limit clips it or, at speed, the supply "
-        f"voltage does: lower {lower} or raise the supply voltage."
+        "high-torque samples. If the reading is right, the current is clipped by the servo's own limit or, at speed, "
+        f"by the supply voltage: lower {lower} or raise the supply voltage."
     )
 
 
 def _least(goal: Array) -> Array:
-    """The smaller of two successive goals, which the motor has had time to follow; 0 if their signs differ.
+    """The smaller of two successive goals, which the motor has had time to reach; 0 if the goals differ in sign.
 
     A sample's current is the response to the goal of the sample before it, and a lagging current loop is not clipping.
     """

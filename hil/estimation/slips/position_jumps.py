@@ -32,8 +32,8 @@ def jump_warnings(config: Config, facts: RunFacts, samples: NDArray[np.void]) ->
         found.append(
             f"{config.joints[index].name}: the position jumped by {size:+.3f} rad "
             f"({abs(size) / facts.position_step[index]:.0f} encoder steps) at {time:.2f} s{others}. The velocity "
-            "before and after does not explain this: all later positions are shifted. Check the horn's screws, the "
-            "encoder's magnet and the cable, then record again."
+            "before and after the jump does not explain it; all later positions are shifted. Check the horn's screws, "
+            "the encoder's magnet and the cable, then record again."
         )
     return found
 

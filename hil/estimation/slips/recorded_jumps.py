@@ -66,7 +66,7 @@ def _sentence(jumps: Sequence[Jump], recording: str, joint: str, step: float | N
     others = f" ({len(jumps)} jumps in all)" if len(jumps) > 1 else ""
     return (
         f"{recording}: {joint}: the position jumps by {largest.size:+.3f} rad{steps} at {largest.time:.3f} s{others}, "
-        "between two samples. No motion explains this: all later positions are shifted. Check the horn's screws, the "
+        "between two samples. No motion explains this; all later positions are shifted. Check the horn's screws, the "
         "encoder's magnet and the cable, then record again, or use only the part before or after the jump."
     )
 

@@ -148,7 +148,7 @@ def test_what_cannot_be_read_is_guessed_and_named(tmp_path: Path, mesh: str, why
     assert "tip" in shapes.guessed and shapes.capsules
     (doubt,) = shapes.doubts
     assert doubt.startswith(f'link "tip": its mesh "{mesh}" is not used: ') and why in doubt
-    assert "replaced by a capsule 200 mm long from its joint to its end. The radius of 40 mm is a guess" in doubt
+    assert "A capsule 200 mm long from its joint to its end is used instead. The radius of 40 mm is a guess" in doubt
 
 
 def test_a_base_whose_shape_cannot_be_read_has_none(tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ LIMITS = '<limit lower="-0.94" upper="1.38"'
         (('iyy="', 'iyy="9'), "no mass distribution can have this inertia"),
         ((LIMITS, '<limit lower="-80" upper="80"'), "are these degrees? Limits must be in radians: [-1.4, 1.4]"),
         (("<inertia ", "<no_inertia "), "has a mass but no <inertia>"),
-        (("<box size=", "<mesh filename="), "replaced by a capsule"),
+        (("<box size=", "<mesh filename="), "is used instead"),
         (("", ""), ""),
     ],
 )
@@ -207,7 +207,7 @@ def test_a_mesh_in_millimetres_is_named(tmp_path: Path) -> None:
     (tmp_path / "part.obj").write_text(corners, encoding="utf-8")
     shape = '<collision><geometry><mesh filename="part.obj"{}/></geometry></collision>'
     (doubt,) = shapes_of(one_joint(tmp_path, shape.format(""))).doubts
-    assert 'it is 160 m long: if it is in millimetres, add scale="0.001 0.001 0.001"' in doubt
+    assert 'it is 160 m long; if the file is in millimetres, add scale="0.001 0.001 0.001"' in doubt
     assert not shapes_of(one_joint(tmp_path, shape.format(' scale="0.001 0.001 0.001"'))).doubts
 
 

@@ -67,7 +67,7 @@ def test_every_ready_file_is_right(path: Path) -> None:
         ("[0.80, 0.42]", "[0.80]", r"experiment\.peak_torque has 1 entry; it needs 2"),
         ("[0.80, 0.42]", "[4.0, 0.42]", r"peak_torque: 4 N m for joint 'shoulder' is more than current_limit"),
         ("band = [0.1, 5.0]", "band = [5.0, 0.1]", r"band = \[5\.0, 0\.1\]: must be 0 < low < high"),
-        ("band = [0.1, 5.0]", "lines = [[1, 2], [2, 3]]", r"two joints share a line"),
+        ("band = [0.1, 5.0]", "lines = [[1, 2], [2, 3]]", r"two joints share a harmonic"),
         ("band = [0.1, 5.0]", "", r"give either band or lines"),
         ("baud = 1_000_000", "baud = 1234", r"port\.baud = 1234: must be one of 9600"),
         ("torque_constant = 1.80 ", "", r"joints\[1\]: torque_constant is missing; current"),
@@ -128,7 +128,9 @@ def test_an_absent_file_and_one_that_is_no_text(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"cannot be read: it is a folder\. Name a TOML file\.$"):
         load_config(tmp_path)
     for here in ("", "."):
-        with pytest.raises(ConfigError, match=r"^\. cannot be read: it is the current folder \(as is an empty name\)"):
+        with pytest.raises(
+            ConfigError, match=r"^\. cannot be read: it is the current folder \(an empty name means the same\)"
+        ):
             load_config(here)
 
 

@@ -140,12 +140,13 @@ def test_an_overshoot_is_said_joint_by_joint(planned: float, first: str) -> None
     said = _stops(short_config(CONFIG.read_text(encoding="utf-8")), stopping)
     assert said[0].startswith(first)
     assert said[-3] == (
-        "If something drives shoulder past a limit at these speeds, it overshoots by a turn or more when braked, by a "
-        "turn or more when torque is cut."
+        "If something drives shoulder past a limit at its predicted speed (99 %), the joint overshoots by a turn or "
+        "more when braked and by a turn or more when torque is cut."
     )
     assert (
-        "elbow past a limit at these speeds, it overshoots by less than 0.01 rad when braked, by up to 1.5" in said[-2]
-    )
+        "elbow past a limit at its predicted speed (99 %), the joint overshoots by less than 0.01 rad when braked and "
+        "by up to 1.5"
+    ) in said[-2]
 
 
 def test_without_braking_braked_is_cut() -> None:

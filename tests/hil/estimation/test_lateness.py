@@ -33,7 +33,7 @@ def test_jitter_of_the_loop_is_taken_back(arm_file: Callable[..., Path]) -> None
 
 @pytest.mark.parametrize(
     ("late", "said"),
-    [(12, "this computer was late for 6.0 % of the samples: close other"), (0, "check cable")],
+    [(12, "this computer was late for 6.0 % of the samples: close other"), (0, "check the cable")],
 )
 def test_lost_samples_are_blamed_on_what_lost_them(arm_file: Callable[..., Path], late: int, said: str) -> None:
     config = load_config(arm_file())

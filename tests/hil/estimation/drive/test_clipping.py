@@ -34,7 +34,8 @@ def test_a_clipped_current_is_named_for_each_joint(samples: np.ndarray) -> None:
     said = found.warnings
     assert [each.split()[0] for each in said] == ["shoulder", "elbow"]
     assert all(
-        "received less than" in each and "limit clips it or, at speed, the supply voltage does" in each for each in said
+        "received less than" in each and "clipped by the servo's own limit or, at speed, by the supply" in each
+        for each in said
     )
     assert found.disturbances == ()
 
