@@ -52,7 +52,7 @@ class Segment:
 
     @property
     def peak_goal(self) -> Array:
-        """Largest goal that is expected to be commanded (joints,) [A, or V under PWM]; NaN counts as zero."""
+        """Largest goal that is expected to be commanded (joints,) [A, or V in PWM mode]; NaN counts as zero."""
         peaks: Array = np.nan_to_num(np.abs(self.period_current)).max(axis=0)
         return peaks
 

@@ -45,7 +45,7 @@ class Converted:
 
 
 _FEWEST_IN_A_SEGMENT = 6
-"""Fewest samples in a segment: its initial state alone has two unknowns per joint."""
+"""Smallest number of samples in a segment: its initial state alone has two unknowns per joint."""
 
 
 def convert(table: Table, columns: Columns) -> Converted:
@@ -93,7 +93,7 @@ def convert(table: Table, columns: Columns) -> Converted:
     if whole.segment < _FEWEST_IN_A_SEGMENT * between:
         raise CsvError(
             f"{table.source}: columns.segment = {whole.segment:g} s: a segment must hold at least "
-            f"{_FEWEST_IN_A_SEGMENT} samples, here {_FEWEST_IN_A_SEGMENT * between:.2g} s."
+            f"{_FEWEST_IN_A_SEGMENT} samples, which take {_FEWEST_IN_A_SEGMENT * between:.2g} s here."
         )
     names = tuple(
         table.source if len(long) == 1 else f"{table.source}, part {number}" for number in range(1, len(long) + 1)

@@ -74,7 +74,7 @@ def said(columns: Columns, table: Table) -> str:
 
 
 def _described(kind: str, names: Sequence[str], columns: Columns, table: Table) -> str:
-    """The columns' names, with their units if the header does not state them."""
+    """The columns' names; if the header states no unit, with the configured or the assumed one."""
     given = getattr(columns, f"{kind}_unit", None)
     if given is not None:
         return f"{', '.join(names)} [{given}]"
@@ -156,7 +156,7 @@ def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
     seen = f"several are candidates ({', '.join(some[:12])})" if some else "none has a recognisable name"
     return CsvError(
         f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Specify them in --config ARM.toml "
-        f'(in Python: config="ARM.toml"), for example, if these are the right ones:\n{_example(table)}'
+        f'(in Python: config="ARM.toml"). For example, if these are the right ones:\n{_example(table)}'
     )
 
 

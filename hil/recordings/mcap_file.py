@@ -114,7 +114,7 @@ def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
     if not found:
         what = ", ".join(sorted(refused)) or "no messages"
         raise CsvError(
-            f"{path} holds nothing that can be decoded here: {what}. Readable: JSON and, with "
+            f"{path} holds nothing that can be decoded here: {what}. hil reads JSON and, after "
             "pip install 'hil[recordings]', ROS 2 (cdr)."
         )
 
