@@ -185,7 +185,7 @@ class RunFolder:
         return self.path / "config.toml"
 
     def own_files(self) -> frozenset[str]:
-        """Names of the files that make up the run: those written by a run or an estimate, and descriptions of the arm."""
+        """Names of the files that make up the run: those of the run, of an estimate and of the arm's description."""
         own = _OF_A_START | {"result.json", "lateness.json", "recordings.npz"}
         with suppress(RunFolderError, ConfigError):
             own |= {urdf.name for urdf in _urdfs(self.load_config())}
