@@ -129,8 +129,8 @@ def _other_brackets(header: re.Match[str], lines: list[str], begins: list[int]) 
         return ""
     name = header[2]
     return (
-        f"line {at['[']} has [{name}] and line {at['[[']} [[{name}]]. Write [[{name}]], with two brackets, wherever "
-        "there may be several such tables"
+        f"line {at['[']} has [{name}] and line {at['[[']} has [[{name}]]. Write [[{name}]], with two brackets, "
+        "wherever there may be several such tables"
     )
 
 

@@ -62,7 +62,7 @@ class RecentMotion:
         self._fastest = [_fastest(joint.joint.servo) for joint in config.joints]
 
     def add(self, state: State) -> None:
-        """Store an exchange, unless it is already the latest one."""
+        """Store an exchange, unless it is already stored as the latest one."""
         if not self._states or self._states[-1] is not state:
             self._states.append(state)
 

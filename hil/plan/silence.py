@@ -26,7 +26,7 @@ servo the packet was for.
 
 
 class Limit(NamedTuple):
-    """A time limit [s] and the setting it comes from, as text."""
+    """A time limit [s], and a text that names the setting it comes from."""
 
     seconds: float
     said: str

@@ -113,7 +113,7 @@ def _ordered(source: str, rows: Rows) -> Rows:
 
 
 def _filled(source: str, rows: Rows, held: bool) -> Rows:
-    """Fill short gaps in the torque; drop the rows of long gaps."""
+    """Fill short gaps in the torque; drop the rows in long gaps."""
     hole = ~np.isfinite(rows.torque).all(axis=0)
     if not hole.any():
         return rows

@@ -120,7 +120,7 @@ def _unused(table: Table, columns: Columns) -> list[str]:
 
 
 def _steps(found: Sequence[float | None], position: Values) -> Values:
-    """The encoder steps (joints,); a joint that moves too little to reveal its step is given another joint's."""
+    """The encoder steps (joints,); a joint that moves too little to reveal its step is given that of another joint."""
     known = max((each for each in found if each is not None), default=SMALLEST_STEP)
     swing = np.nanmax(position, axis=1, initial=-np.inf) - np.nanmin(position, axis=1, initial=np.inf)
     other = np.where(swing < LEAST_MOTION * known, known, SMALLEST_STEP)

@@ -186,7 +186,7 @@ def _quoted(name: str) -> str:
 
 
 def _kind(name: str, words: str) -> str:
-    """The kind of column that a name suggests: "other" if certainly not needed, "unknown" if the name is unclear."""
+    """The kind of column that a name suggests: "other" for one that is certainly not needed, "unknown" if unclear."""
     if _TIME.fullmatch(_last(name)):
         return "time"
     found = next((kind for kind, pattern in _KINDS.items() if pattern.search(words)), "unknown")

@@ -321,7 +321,7 @@ class StabiliserShare:
 
     @property
     def share(self) -> PerJoint:
-        """RMS of the stabiliser relative to that of the total torque, per joint; can exceed 1."""
+        """RMS of the stabiliser's torque relative to that of the total torque, per joint; can exceed 1."""
         return tuple(rms / max(whole, 1e-12) for rms, whole in zip(self.rms, self.commanded_rms, strict=True))
 
     def said(self, names: Sequence[str]) -> str:

@@ -204,8 +204,8 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
             return
         except DriverError as error:
             fix = (
-                f"{error} It answers pings: if it never answers reads, its Status Return Level is 0; power-cycle "
-                "it to reset that level to 2."
+                f"{error} The servo answers pings: if it never answers reads, its Status Return Level is 0; "
+                "power-cycle it to reset that level to 2."
             )
             yield Finding(Level.STOP, where, "registers", "cannot be read", fix)
             return
