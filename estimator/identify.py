@@ -61,7 +61,7 @@ def identify(
     near: Near | None = None,
     options: LikelihoodOptions = LIKELIHOOD,
 ) -> Estimate:
-    """Estimate the parameters of `model`: regression on Fourier lines, then maximum likelihood.
+    """Estimate the parameters of `model`: regression on Fourier coefficients, then maximum likelihood.
 
     The result is deterministic to the last digit.
 

@@ -73,11 +73,11 @@ class CoordinateOptions:
 
 @dataclass(frozen=True)
 class LinearOptions:
-    """Options for stage 1, the regression on Fourier lines."""
+    """Options for stage 1, the regression on Fourier coefficients."""
 
     coulomb_width: float = 0.05
     """Width of the smoothed Coulomb step [rad/s]: roughly the velocity error of a sticking joint that results from
-    omitting Fourier lines.
+    omitting Fourier coefficients.
     """
     max_condition: float = 1e8
 

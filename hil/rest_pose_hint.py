@@ -10,8 +10,9 @@ def within_limits(position: float, limits: Sequence[float]) -> float:
     """Return `position` if it is within the limits, otherwise the angle a whole number of turns away that is nearest to
     the middle of the limits.
 
-    A servo does not count turns while it is off, so `position` is in the turn closest to the rest pose or to zero.
-    If no such angle is within the limits, the result is the one that exceeds them least. All angles are in rad.
+    A servo does not count turns while it is off, so `position`, the angle closest to the rest pose or to zero, may be
+    wrong by whole turns. If no such angle is within the limits, the result exceeds them by as little as possible. All
+    angles are in rad.
     """
     low, high = limits
     if low <= position <= high:

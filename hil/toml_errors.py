@@ -130,7 +130,7 @@ def what_is_wrong(detail: Any) -> str:
 
 
 def _exact_length(detail: Any, root: type[BaseModel]) -> str:
-    """Say how many entries a list that is too short or too long must have, if only one number is allowed."""
+    """Say how many entries a list must have if it is too short or too long and only one length is allowed."""
     if detail["type"] not in {"too_short", "too_long"}:
         return ""
     field = _field_of(detail, root)

@@ -92,7 +92,7 @@ def _not_toml(path: Path, error: Exception, text: str) -> str:
 
 
 def _given_twice(error: str, text: str, number: int) -> str:
-    """Name the key or table that the statement ending on line `number` repeats; "" for other errors."""
+    """Name the key or table that is repeated by the statement ending on line `number`; "" for other errors."""
     if not error.startswith(("Cannot overwrite", "Cannot declare")):
         return ""
     lines, begins = text.split("\n"), _beginnings(text)
@@ -119,7 +119,7 @@ def _given_twice(error: str, text: str, number: int) -> str:
 
 
 def _other_brackets(header: re.Match[str], lines: list[str], begins: list[int]) -> str:
-    """Say that the table of this header is given both as [name] and as [[name]]; "" if it is not."""
+    """Return a message if the table of this header is given both as [name] and as [[name]], otherwise ""."""
     at: dict[str, int] = {}
     for count in begins:
         other = _HEADER.match(lines[count - 1])
@@ -129,8 +129,8 @@ def _other_brackets(header: re.Match[str], lines: list[str], begins: list[int]) 
         return ""
     name = header[2]
     return (
-        f"line {at['[']} has [{name}] and line {at['[[']} [[{name}]]. Write [[{name}]], with two brackets, wherever "
-        "there may be several such tables"
+        f"line {at['[']} has [{name}] and line {at['[[']} has [[{name}]]. Write [[{name}]], with two brackets, "
+        "wherever there may be several such tables"
     )
 
 

@@ -4,7 +4,7 @@ The arm is a MuJoCo model with the described geometry and masses. The unknowns a
 each, a Cholesky factor relative to the description's), and armature, damping, friction loss and a constant torque of
 every joint, about as many as stage 2's. The arm would fall in an open-loop simulation, so the software spring and
 damper are part of the model, as an affine bias. The method gets every advantage: the true lag, the initial state of the
-period's Fourier lines, an initial guess as good as ours, its own optimiser with rollouts on all cores, and two
+period's Fourier coefficients, an initial guess as good as ours, its own optimiser with rollouts on all cores, and two
 integration steps per sample.
 """
 

@@ -1,1 +1,1 @@
-"""Recordings, settled periods, segments, and their Fourier lines."""
+"""Recordings, settled periods, segments, and their Fourier coefficients."""

@@ -1,4 +1,4 @@
-"""Fourier lines of a settled period: noise, cut-off, exact derivatives, the held command."""
+"""Fourier coefficients of a settled period: noise, cut-off, exact derivatives, the held command."""
 
 from dataclasses import dataclass
 
@@ -70,7 +70,7 @@ def without_jump(position: Array) -> Array:
 
 
 def slow_part(position: Array, lines: int) -> Array:
-    """Return the part of a period (joints, samples) that its first `lines` Fourier lines represent, as samples."""
+    """Return the part of a period (joints, samples) that its first `lines` Fourier coefficients describe, as samples."""
     kept = np.fft.rfft(position, axis=1)
     kept[:, lines:] = 0.0
     return np.asarray(np.fft.irfft(kept, position.shape[1], axis=1))

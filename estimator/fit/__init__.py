@@ -1,1 +1,1 @@
-"""Least squares on Fourier lines, then maximum likelihood."""
+"""Least squares on Fourier coefficients, then maximum likelihood."""

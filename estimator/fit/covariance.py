@@ -73,8 +73,8 @@ def correlation_time(residuals: Sequence[Array], options: CovarianceOptions = DE
 def structured_share(residual: Array) -> Array:
     """Return the fraction (joints,) of the power of each residual (joints, samples) that is not white.
 
-    The level of white noise is estimated from the upper half of the Fourier lines, far above the frequencies of the
-    motion. The fraction is 0 if the residual does not differ significantly from white noise.
+    The level of white noise is estimated from the upper half of the spectrum, far above the frequencies of the motion.
+    The fraction is 0 if the residual does not differ significantly from white noise.
     """
     samples = residual.shape[1]
     power = np.abs(np.fft.rfft(residual, axis=1)) ** 2 / samples**2

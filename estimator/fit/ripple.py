@@ -1,7 +1,7 @@
 """Period of torque ripple and cogging over the joint angle: a scan that needs no initial guess.
 
-For each number of cycles per turn, the regression on Fourier lines gets two more columns: torque times the sine and the
-cosine of that multiple of the angle or, for cogging, the sine and the cosine themselves. The best number is the
+For each number of cycles per turn, the regression on Fourier coefficients gets two more columns: torque times the sine
+and the cosine of that multiple of the angle or, for cogging, the sine and the cosine themselves. The best number is the
 likelihood's initial guess.
 """
 
@@ -61,7 +61,9 @@ def _parts(each: list[tuple[Array, Array, Array, Array]]) -> list[tuple[Array, i
 def _prepared(
     period: SettledPeriod, motion: PeriodicMotion, harmonics: int, joint: int, delay: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return a joint's columns and torque on the Fourier lines as real numbers, and both torque and angle over time."""
+    """Return the Fourier coefficients of a joint's columns and torque as real numbers; also its torque and angle over
+    time.
+    """
     Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)[joint]
     velocity = motion.velocity[joint]
     sign = np.tanh(velocity / COULOMB_WIDTH)

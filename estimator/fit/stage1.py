@@ -1,4 +1,4 @@
-"""Stage 1: linear least squares on the Fourier lines of settled periods, without initial guesses or local minima.
+"""Stage 1: linear least squares on Fourier coefficients of settled periods, without initial guesses or local minima.
 
 The motion's lines above the noise are differentiated exactly, the regressor is evaluated on the resulting motion, and
 regressor and torque are compared line by line. The command's derivative is one more column, whose coefficient is the

@@ -1,4 +1,4 @@
-"""Noise, nonlinear distortion and model error, separated by the Fourier lines on which they appear.
+"""Noise, nonlinear distortion and model error, separated by the spectral lines on which they appear.
 
 The method is that of Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. Line k is the
 component of a signal with k cycles per period. An arm that is excited only on odd lines responds on these lines and,
@@ -23,7 +23,7 @@ EXCITED = 1e-4  # fraction of the strongest line's power; the rounding of a comm
 
 @dataclass(frozen=True)
 class LineGroup:
-    """A group of Fourier lines, such as all excited lines or all even lines."""
+    """A group of spectral lines, such as all excited lines or all even lines."""
 
     lines: int
     """Number of lines."""
@@ -35,12 +35,12 @@ class LineGroup:
 
 @dataclass(frozen=True)
 class Distortion:
-    """RMS per line (joints,) [encoder steps] for each group of Fourier lines."""
+    """RMS per line (joints,) [encoder steps] for each group of spectral lines."""
 
     noise: Array
     """Noise per line: the larger of two estimates, from the scatter between periods and from the highest lines."""
     excited: LineGroup
-    """The Fourier lines on which at least one joint was excited."""
+    """The spectral lines on which at least one joint was excited."""
     odd: LineGroup | None
     """Unexcited odd lines up to the highest excited one; None unless all excited lines are odd."""
     even: LineGroup | None

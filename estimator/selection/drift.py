@@ -215,7 +215,7 @@ def _is_finite(A: Array, r: Array) -> bool:
 
 
 def _first_state(period: SettledPeriod) -> Array:
-    """Return angles and velocities at the first sample (2, joints), computed from the motion's Fourier lines."""
+    """Return angles and velocities at the first sample (2, joints), computed from the motion's Fourier coefficients."""
     lines = lines_of(period.filled())
     motion = motion_of(lines, cut_off(lines), period.fundamental, period.samples)
     return np.stack((motion.position[:, 0], motion.velocity[:, 0]))

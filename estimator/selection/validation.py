@@ -24,9 +24,9 @@ class Levels:
     """RMS by source, in encoder steps (joints,)."""
 
     excited: Array
-    """Motion on the Fourier lines on which at least one joint was excited."""
+    """Motion on the spectral lines on which at least one joint was excited."""
     distortion: Array
-    """Motion on the other Fourier lines, caused by the arm's nonlinearity."""
+    """Motion on the other spectral lines, caused by the arm's nonlinearity."""
     noise: Array
     """Measured noise of one sample (`SettledPeriod.noise`)."""
     scatter: Array

@@ -48,7 +48,7 @@ WINDOW_S = 0.3
 class ChainWatch:
     """Checks every sample against the model.
 
-    planned: largest goal of each joint [A, or V under PWM]. arms: prior knowledge of the arm; by default, from the
+    planned: largest goal of each joint [A, or V in PWM mode]. arms: prior knowledge of the arm; by default, from the
     configuration. interval, explain: as for `ModelWatch`.
     """
 

@@ -50,9 +50,9 @@ may be rejecting its goals.
 class Guard:
     """Compares each sample with the limits of the configuration. `look` raises SafetyStop.
 
-    planned: largest planned goal of each joint [A, or V under PWM]; by default, from the configuration.
+    planned: largest planned goal of each joint [A, or V in PWM mode]; by default, from the configuration.
 
-    interval: time between two exchanges [s]; by default, that between two samples. patience: how long an exchange waits
+    interval: time between two exchanges [s]; by default, the sample period. patience: how long an exchange waits
     for missing replies [s].
 
     heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did.

@@ -223,8 +223,8 @@ _watch: Callable[..., int] = compiled(_watch_loop)
 class ModelWatch:
     """Checks every sample against the model.
 
-    planned: largest goal of each joint [A, or V under PWM]. arms: prior knowledge of the arm; by default, from the
-    configuration. interval: time between two exchanges [s]; by default, that between two samples. explain: raises
+    planned: largest goal of each joint [A, or V in PWM mode]. arms: prior knowledge of the arm; by default, from the
+    configuration. interval: time between two exchanges [s]; by default, the sample period. explain: raises
     SafetyStop if the latest samples show why a moving joint lacks torque [N m].
     """
 

@@ -453,5 +453,5 @@ class Stream:
 
 
 def _largest_goals(plan: Plan) -> list[float]:
-    """Largest goal of each joint [A, or V under PWM]; NaN counts as 0 here, since the guard rejects it."""
+    """Largest goal of each joint [A, or V in PWM mode]; NaN counts as 0 here, since the guard rejects it."""
     return [float(peak) for peak in np.max([segment.peak_goal for segment in plan.segments], axis=0)]

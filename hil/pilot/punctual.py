@@ -1,4 +1,4 @@
-"""Repetition of runs that were stopped because this computer was late, since they reveal nothing about the arm."""
+"""Repeat runs that were stopped because this computer was late: such runs reveal nothing about the arm."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ MOST_REPEATS = 3
 
 
 def punctual(play: Callable[[], str], config: Config, folder: RunFolder, name: str, say: Callable[[str], None]) -> str:
-    """Call `play` and return its result; repeat this if deadlines were missed, at most MOST_REPEATS times.
+    """Call `play` and return its result; if deadlines were missed, call it again, up to MOST_REPEATS times.
 
     The recording of a stopped run is set aside in `folder`. Raises the same errors as `play`.
     """

@@ -28,7 +28,7 @@ def rehearse_in_steps(
 ) -> DryRun:
     """Simulate what `hil identify` would do; `result` is a run folder or result.json of an earlier identification.
 
-    Raises ConfigError, ResultError, RunFolderError, NoSafeTorque (if `hil identify` would refuse too) and, with
+    Raises ConfigError, ResultError, RunFolderError, NoSafeTorque (only if `hil identify` would raise it too) and, with
     `servos`, DriverError.
     """
     only_planar(config, "a dry run")
@@ -51,7 +51,7 @@ def rehearse_in_steps(
 
 
 def _largest(held: Config, ensemble: Ensemble, executor: Executor | None) -> Amplitude | None:
-    """The largest torque that is safe for every arm; None if there is none, so that only the pilot can find one."""
+    """The largest torque that is safe for every arm; None if there is none and only a pilot can find a safe torque."""
     try:
         found = largest_amplitude(held, ensemble, executor=executor)
     except NoSafeTorque:

@@ -51,7 +51,7 @@ class Search:
     """Largest range of motion of each joint so far (joints,) [rad]."""
 
     springs: Mask | None = None
-    """Which joints had a spring in the last run with a stabiliser (joints,); None if there was none."""
+    """Which joints had a spring in the last run with a stabiliser (joints,); None before the first such run."""
     options: PilotOptions = DEFAULTS
     from_earlier: bool = False
     """Whether the belief comes from the result of an earlier run, and no run so far has contradicted it."""
@@ -100,7 +100,7 @@ class Search:
     def find(self) -> tuple[Config, Amplitude]:
         """Find the configuration and the amplitude of the full run.
 
-        Raises the same errors as a run, and ExperimentError if a joint does not move at its current limit.
+        Raises the same errors as a run, and ExperimentError if a joint does not move even at its largest torque.
         """
         self._pilot()
         return self._raise_to_limits()
@@ -150,8 +150,8 @@ class Search:
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
         """The largest amplitude that is safe for all plausible arms. share: fraction of each limit that they may use.
 
-        If there is no such amplitude, that of the last run is used, provided that the real arm has shown it to be safe,
-        and otherwise a smaller one. Raises NoSafeTorque if there has been no run yet.
+        If there is no such amplitude, the amplitude of the last run is used, or a smaller one if the real arm has
+        exceeded a limit. Raises NoSafeTorque if there is no such amplitude and there has been no run yet.
         """
         ensemble, options = self.belief.ensemble(self._farther), self.options
         cap = self.cap
@@ -183,7 +183,7 @@ class Search:
         return float((allowed / np.maximum(swing, 0.02)).max())
 
     def _pilot(self) -> None:
-        """Play small runs until every joint moves, with more torque from run to run, up to the current limits."""
+        """Play small runs until every joint moves, raising the torque from run to run, up to the joints' limits."""
         options = self.options
         while True:
             number = len(self.steps)
@@ -217,7 +217,7 @@ class Search:
             yield f"{said} Repeating with more torque."
 
     def _pilot_amplitude(self, config: Config, number: int) -> tuple[Config, Amplitude]:
-        """Configuration and amplitude of a pilot.
+        """The configuration and the amplitude of a pilot run.
 
         A joint that has not moved yet gets moderately more torque than before. If that is too much for some plausible
         arms, its position limits are narrowed around its current position (hil.pilot.breakaway).
@@ -273,8 +273,8 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """Return `found` or, if it leaves much of the range unused, the best amplitude with other waves, provided that
-        it uses more.
+        """Return `found`; if it leaves much of the position range unused, try other waves and return the amplitude that
+        uses most of the range.
         """
         options = self.options
         limited = (found.peak_torque >= options.at_limit * most_torque(config)).all() or self.cap is not None
@@ -295,7 +295,7 @@ class Search:
         self.learn(played_config, played)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude) -> Played:
-        """Play one run from where the last one left the arm; its motion is checked against the plausible arms."""
+        """Play one run from where the last one left the arm, and compare its motion with that of the plausible arms."""
         arms = self.belief.ensemble(self._farther)
         return self.player.play(config if self.pose is None else _from_anywhere(config), folder, name, found, arms)
 
@@ -382,12 +382,12 @@ def pilot_config(config: Config, options: PilotOptions = DEFAULTS) -> Config:
 
 
 def _from_anywhere(config: Config) -> Config:
-    """The configuration for an arm that friction may have left away from its rest pose after an earlier run."""
+    """The configuration for an arm that friction may be holding away from its rest pose after an earlier run."""
     return config.model_copy(update={"arm": config.arm.model_copy(update={"rest_tolerance": 2 * np.pi})})
 
 
 def _within_limits(config: Config, pose: Array, inside: float) -> Array:
-    """Clip a pose in which a stopped run left the arm beyond its limits: the next run begins by moving inwards."""
+    """Clip the pose of an arm that a stopped run may have left beyond its limits: the next run moves it inwards."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     return np.asarray(np.clip(pose, middle - inside * half, middle + inside * half))

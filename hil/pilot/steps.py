@@ -47,7 +47,7 @@ class Step:
 
     @property
     def within(self) -> bool:
-        """Whether all measured peaks that have a limit stayed within those predicted for 99 % of the arms."""
+        """Whether all measured peaks that have a limit stayed within the peaks predicted for 99 % of the arms."""
         low, high, velocity = self.seen[:GUARDED]
         bounds = self.quantile
         return bool((low >= bounds[0]).all() and (high <= bounds[1]).all() and (velocity <= bounds[2]).all())
@@ -177,7 +177,7 @@ def _beside(rows: list[tuple[str, ...]]) -> list[str]:
 
 
 def _below(rows: list[tuple[str, ...]]) -> list[str]:
-    """A table with one line per quantity and joint, which fits a terminal of 80 columns."""
+    """A table that fits a terminal of 80 columns: one line per quantity and joint."""
     head, *others = rows
     width = max(map(len, head))
     return [

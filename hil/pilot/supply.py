@@ -17,7 +17,7 @@ from hil.runs.recording import Phase
 
 _DRIVEN = (Phase.RAMP_IN, Phase.WARM_UP, Phase.PERIODIC, Phase.RAMP_OUT)
 _LAST_S = 0.25
-"""The sample that caused a stop is searched for within this time before the stop [s]."""
+"""Time before a stop within which the sample that caused it is searched for [s]."""
 
 
 def delivered_speed(config: Config, samples: NDArray[np.void]) -> Array:

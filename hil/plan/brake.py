@@ -1,10 +1,10 @@
-"""The first part of a stop, if possible: braking, with a current opposing each joint's velocity.
+"""The first part of a stop, if possible: braking with currents that oppose the joints' velocities.
 
 Braking lasts for a bounded time and stays within the current limits. It ends at once when a reply or deadline is
 missed, a servo raises an alert, a second signal arrives, or a joint speeds up, as it does if its motor turns the wrong
 way.
 
-A joint is braked against its reported velocity only as far as the change of its position confirms it
+A joint is braked against its reported velocity only as far as the change of its position confirms that velocity
 (`hil.plan.recent_motion`), so that no current acts in the direction of its actual motion.
 """
 
@@ -24,7 +24,7 @@ A stronger brake stops the arm hardly any sooner, and throws it back farther if 
 LIGHTEST = 0.5
 """Smallest inertia that a joint is assumed to have, relative to the typical rotor inertia of its servo.
 
-If a light joint is braked too hard, it is thrown back, faster than it came, before its velocity is read again.
+A light joint that is braked too hard is thrown back faster than it came before its velocity can be read again.
 """
 
 DELAY_S = 0.002
@@ -51,7 +51,7 @@ def braking_gains(config: Config, interval: float | None = None) -> list[float]:
     """Braking gains [A s/rad, or V s/rad in PWM mode] with which no single goal reverses the motion of the lightest
     joint.
 
-    interval: time between two exchanges [s]; by default, that on a fast bus.
+    interval: time between two exchanges [s]; by default, the interval on a fast bus.
     """
     sample = 1.0 / config.experiment.rate
     held = (sample / max(1, int(sample / CHECK_S + 1e-6)) if interval is None else interval) + DELAY_S
@@ -67,7 +67,7 @@ def braking_gains(config: Config, interval: float | None = None) -> list[float]:
 class Brake:
     """Computes goal currents that oppose the joints' velocities.
 
-    recent: the exchanges before the stop. Without these, a joint is braked only from its second state on.
+    recent: the exchanges before the stop. Without them, a joint is braked only once two of its states are known.
     """
 
     def __init__(self, config: Config, interval: float | None = None, recent: RecentMotion | None = None) -> None:

@@ -162,7 +162,7 @@ def check_clearance(config: Config, plan: Plan) -> None:
             nearest = space.nearest(motion.position, on_the_way)
             if nearest.room < 0.0:
                 raise ConfigError(
-                    f"{config.path}: the path has too little clearance: {nearest}, at least "
+                    f"{config.path}: the path has too little clearance: {nearest}; at least "
                     f"{1e3 * nearest.needed:.0f} mm is required. Move joint_path.centre, "
                     "lower joint_path.swing, or correct [clearance] and the URDF's collision geometry; "
                     "`hil dry-run` shows where."
@@ -194,7 +194,7 @@ def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
             raise NoHeadroom(
                 f"{config.path}: joint_path: {joint.name!r} needs about {peak:.3g} N m for this path, more than "
                 f"{100 * TORQUE_SHARE:.0f} % of its limit of {most:.3g} N m. That leaves too little margin for errors "
-                f"of the described masses: lower joint_path.speed or swing, or raise its {joint.goal_limit_name}."
+                f"in the described masses: lower joint_path.speed or swing, or raise its {joint.goal_limit_name}."
             )
 
 

@@ -8,6 +8,6 @@ def how_to_find_torque(config: Config) -> str:
     if config.is_chain or config.arm.link_lengths is not None:
         return "`hil dry-run` finds a safe value."
     return (
-        "`hil dry-run` finds a safe value, but it needs the length of each link: measure from joint to joint and to "
-        "the tip with a ruler, and set arm.link_lengths = [...] in m."
+        "`hil dry-run` finds a safe value, but it needs the length of each link: measure with a ruler from joint to "
+        "joint, and from the last joint to the tip; then set arm.link_lengths = [...] in m."
     )

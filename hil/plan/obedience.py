@@ -3,9 +3,9 @@
 While the torque is constant, a reversed motor cannot be distinguished from an external push: either way, the arm moves
 as if an additional torque acted on the joint. The goal of a suspect joint is therefore removed briefly, while the other
 goals are held. Unexplained torque that comes from the joint's own motor then falls in proportion to the motor's torque,
-through the same filter; torque from a push does not. If the unexplained torque falls earlier or later, the joint is
-tested again. The test is so short that an unpowered joint gains less speed from gravity than a reversed motor would
-give it.
+through the same filter; torque from a push does not. If the unexplained torque falls earlier or later than that, the
+joint is tested again. The test is so short that an unpowered joint gains less speed from gravity than a reversed motor
+would give it.
 """
 
 from collections.abc import Sequence
@@ -25,17 +25,17 @@ ENOUGH = 0.45
 LONGEST_TEST_S = 0.06
 
 TURNED, PUSHED = 1.1, 0.7
-"""Drop of the unexplained torque, relative to that of the joint's own torque, when its goal is removed: 2 for a
-reversed motor, less right after the reversal, 1 for a motor without torque, 0 for a push. Above the first limit, the
-motor counts as reversed; up to the second, the joint counts as pushed; in between, it is tested again.
+"""Drop in the unexplained torque, relative to the drop in the joint's own torque, when the joint's goal is removed: 2
+for a reversed motor (less right after the reversal), 1 for a motor without torque, 0 for a push. Above the first limit,
+the motor counts as reversed; up to the second, the joint counts as pushed; in between, it is tested again.
 """
 
 MOST_TURNED = 3.0
 """Ratio of drops, as in `TURNED`, above which the unexplained torque did not come from the joint's motor alone."""
 
 UNEVEN = 0.3
-"""Deviation from a drop in proportion to the joint's own torque, relative to the total drop, above which the
-unexplained torque has another cause.
+"""Largest deviation from a proportional drop, relative to the total drop: if the unexplained torque deviates more from
+a drop in proportion to the joint's own torque, it has another cause.
 """
 
 MOST_UNEVEN = 3
@@ -108,7 +108,7 @@ class Obedience:
         return self._tests[joint] is not None
 
     def is_pushed(self, joint: int) -> bool:
-        """Whether a test has shown that something pushes or pushed this joint."""
+        """Whether a test has shown that something is pushing this joint or has pushed it."""
         return self._pushed[joint]
 
     def question(self, joint: int, now: float) -> bool:
@@ -134,7 +134,7 @@ class Obedience:
                 self._tests[joint] = _Test(now, _drives(lacking, velocity[joint]))
 
     def look(self, found: Residual, velocity: Sequence[float], now: float) -> int:
-        """Process an exchange; return a joint whose motor is reversed, -1 if there is none."""
+        """Process an exchange; return the index of a joint whose motor is reversed, or -1 if there is none."""
         for joint, test in enumerate(self._tests):
             if test is None:
                 continue

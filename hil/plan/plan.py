@@ -52,7 +52,7 @@ class Segment:
 
     @property
     def peak_goal(self) -> Array:
-        """Largest goal that is expected to be commanded (joints,) [A, or V under PWM]; NaN counts as zero."""
+        """Largest goal that is expected to be commanded (joints,) [A, or V in PWM mode]; NaN counts as zero."""
         peaks: Array = np.nan_to_num(np.abs(self.period_current)).max(axis=0)
         return peaks
 
@@ -85,7 +85,7 @@ class Plan:
 
     @property
     def capacity(self) -> int:
-        """Largest number of samples that the plan may take."""
+        """Largest number of samples that carrying out the plan may take."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
         still = self.rest_samples + 3 * self.end_samples
@@ -148,12 +148,12 @@ def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) ->
 
 
 def rest_window(rate: float) -> int:
-    """Number of samples after which the stream checks whether the arm has come to rest."""
+    """Number of samples between two checks of whether the arm has come to rest."""
     return max(1, round(0.2 * rate))
 
 
 def _end_samples(config: Config) -> int:
-    """Largest number of samples for coming to rest, a multiple of the window."""
+    """Largest number of samples to wait until the arm is at rest: a multiple of the window."""
     rate = config.experiment.rate
     window = rest_window(rate)
     return window * max(1, math.ceil(config.safety.rest_time * rate / window))

@@ -19,8 +19,7 @@ from hil.drivers.state import State
 __all__ = ["RecentMotion", "Travel"]
 
 SHORT_S, LONG_S = 0.004, 0.02
-"""The two spans over which motion is evaluated [s]; each reaches back to the latest exchange that is at least that old.
-"""
+"""The two spans over which motion is evaluated [s]; each begins at the newest exchange that is at least that old."""
 
 _OLDEST_S = 0.05
 _LONGER = 1.5
@@ -36,7 +35,7 @@ _MORE = 1.25
 
 CONTRADICTS = 2.0
 """A velocity contradicts the position if it is beyond this multiple of the range that the position allows: at constant
-acceleration from standstill, the last velocity is twice the mean one.
+acceleration from standstill, the final velocity is twice the mean.
 """
 
 UNREACHABLE = 3.0
@@ -53,7 +52,7 @@ class Travel(NamedTuple):
 
 
 class RecentMotion:
-    """The latest exchanges. interval: time between two of them [s]; by default, that between two samples."""
+    """The latest exchanges. interval: time between two of them [s]; by default, the sample period."""
 
     def __init__(self, config: Config, interval: float | None = None) -> None:
         interval = 1.0 / config.experiment.rate if interval is None else interval
@@ -63,7 +62,7 @@ class RecentMotion:
         self._fastest = [_fastest(joint.joint.servo) for joint in config.joints]
 
     def add(self, state: State) -> None:
-        """Store an exchange, unless it is already the latest one."""
+        """Store an exchange, unless it is already stored as the latest one."""
         if not self._states or self._states[-1] is not state:
             self._states.append(state)
 
@@ -92,8 +91,8 @@ class RecentMotion:
         return found
 
     def contradicts(self, joint: int, velocity: float) -> bool:
-        """Whether a velocity is impossible for the joint: no known change of its position allows it, or none is known
-        and no servo turns that fast.
+        """Whether a velocity is impossible for the joint: no known change of its position allows it or, if no change is
+        known, no servo of this model turns that fast.
         """
         travels = self.travels(joint)
         if not travels:
@@ -159,7 +158,7 @@ class RecentMotion:
 
 
 def _since(known: list[State], last: State, span: float) -> State:
-    """The latest state that is at least `span` [s] older than the last one, or the oldest if there is none."""
+    """The newest state that is at least `span` [s] older than `last`; if there is none, the oldest known one."""
     now = last.time_before_write
     return next((state for state in reversed(known) if now - state.time_before_write >= span), known[0])
 

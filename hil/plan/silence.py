@@ -1,4 +1,4 @@
-"""Limits on the time without replies and the time without commands [s], within the servos' watchdog timeout."""
+"""Limits on the time without replies and on the time without commands [s], both below the servos' watchdog timeout."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ WATCHDOG_SHARE = 0.8
 """Upper bound on both limits, relative to the watchdog timeout."""
 
 _FEWEST_MISSING = 2
-"""Smallest number of missing replies that counts: a single lost packet is not a fault, however low the rate."""
+"""Smallest number of missing replies that counts as a fault: a single lost packet does not, however low the rate."""
 
 _ROUNDING_S = 1e-6
 
@@ -20,13 +20,13 @@ switching it off takes some time.
 
 BRIDGED_ALONE_S = 0.028
 """How long servos may fail to reply while an arm is being lowered and another servo replies [s]. The silent servo may
-have changed its ID: then only its Bus Watchdog, which counts from the last packet on the bus for any servo, can stop
-it.
+have changed its ID: then only its Bus Watchdog can stop it, and that counts from the last packet on the bus, whichever
+servo the packet was for.
 """
 
 
 class Limit(NamedTuple):
-    """A time limit [s] and the setting it comes from, as text."""
+    """A time limit [s], and a text that names the setting it comes from."""
 
     seconds: float
     said: str

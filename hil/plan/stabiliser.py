@@ -113,7 +113,7 @@ def check_rate(config: Config) -> None:
 
 
 def feedback_of(config: Config) -> Feedback:
-    """The configured stabiliser, with zero gains if there is none, and the torque limits [N m]."""
+    """The configured stabiliser and the torque limits [N m]; without a stabiliser, the gains are zero."""
     limit = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
     pose = np.array(config.arm.rest_pose)
     if config.stabiliser is None:
@@ -122,7 +122,7 @@ def feedback_of(config: Config) -> Feedback:
 
 
 def stabiliser_share(config: Config, samples: NDArray[np.void]) -> StabiliserShare:
-    """The stabiliser's contribution to the torque in consecutive rows of a recording, from one multisine."""
+    """The stabiliser's contribution to the torque in consecutive rows recorded during one multisine."""
     torque = feedback_torque(config, samples)
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     commanded = samples["goal_current"][1:] * constants

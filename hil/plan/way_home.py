@@ -1,6 +1,7 @@
 """Path along which a stop lowers a spatial arm: from any pose to the rest pose, clear of obstacles, in bounded time.
-The path is straight in joint space if a straight one is clear. Otherwise it leads straight to the first reachable pose
-of the planned transition from the rest pose, and follows that transition, which is known to be clear, backwards.
+
+The path is straight in joint space if a straight path is clear. Otherwise it leads straight to the first reachable pose
+of the planned transition from the rest pose, and then back along that transition, which is known to be clear.
 """
 
 import numpy as np
@@ -16,8 +17,8 @@ STATIONS = 16
 """Number of poses of the planned transition at which an arm may join it."""
 
 PULL_PER_S, PULL_SHARE = 2.0, 0.25
-"""Growth rate of the additional torque towards the path, relative to the spring's torque [1/s], and its largest value,
-relative to the joint's largest torque.
+"""Growth rate of the additional torque towards the path, relative to the spring's torque [1/s], and largest additional
+torque, relative to the joint's largest torque.
 
 At a low sampling rate the spring alone is too weak to overcome the friction of a light joint.
 """

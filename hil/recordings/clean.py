@@ -113,7 +113,7 @@ def _ordered(source: str, rows: Rows) -> Rows:
 
 
 def _filled(source: str, rows: Rows, held: bool) -> Rows:
-    """Fill short gaps in the torque; drop the rows of long gaps."""
+    """Fill short gaps in the torque; drop the rows in long gaps."""
     hole = ~np.isfinite(rows.torque).all(axis=0)
     if not hole.any():
         return rows
@@ -131,9 +131,9 @@ def _filled(source: str, rows: Rows, held: bool) -> Rows:
         row[~known] = row[before][~known] if held else np.interp(rows.time[~known], rows.time[known], row[known])
     notes = []
     if (hole & ~out).any():
-        notes.append(f"{source}: torque was filled in where it was missing, in {_rows(hole & ~out)}.")
+        notes.append(f"{source}: missing torque was filled in ({_rows(hole & ~out)}).")
     if out.any():
-        notes.append(f"{source}: rows without a torque were left out, {_rows(out)}.")
+        notes.append(f"{source}: rows without a torque were left out ({_rows(out)}).")
     return Rows(rows.time, torque, rows.position, rows.notes).kept(~out, *notes)
 
 

@@ -45,7 +45,6 @@ class Converted:
     unusable: bool = False
 
 
-
 def convert(table: Table, columns: Columns) -> Converted:
     """Convert `table` to recordings.
 
@@ -91,7 +90,7 @@ def convert(table: Table, columns: Columns) -> Converted:
     if whole.segment < FEWEST * between:
         raise CsvError(
             f"{table.source}: columns.segment = {whole.segment:g} s: a segment must hold at least "
-            f"{FEWEST} samples, here {FEWEST * between:.2g} s."
+            f"{FEWEST} samples, which take {FEWEST * between:.2g} s here."
         )
     names = tuple(
         table.source if len(long) == 1 else f"{table.source}, part {number}" for number in range(1, len(long) + 1)
@@ -118,7 +117,7 @@ def _unused(table: Table, columns: Columns) -> list[str]:
 
 
 def _steps(found: Sequence[float | None], position: Values) -> Values:
-    """The encoder steps (joints,); a joint that moves too little to reveal its step is given another joint's."""
+    """The encoder steps (joints,); a joint that moves too little to reveal its step is given that of another joint."""
     known = max((each for each in found if each is not None), default=SMALLEST_STEP)
     swing = np.nanmax(position, axis=1, initial=-np.inf) - np.nanmin(position, axis=1, initial=np.inf)
     other = np.where(swing < LEAST_MOTION * known, known, SMALLEST_STEP)

@@ -25,7 +25,7 @@ def read_csv_table(path: Path) -> Table:
         raise CsvError(f"{path} cannot be read: it is HTML, XML or JSON. Export the data as CSV.")
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
     if long := [number for number, line in lines if len(line) > csv.field_size_limit()]:
-        raise CsvError(f"{path}, line {long[0]}: at most {csv.field_size_limit()} characters can be read.")
+        raise CsvError(f"{path}, line {long[0]} is too long: at most {csv.field_size_limit()} characters can be read.")
     remarks = [line for _, line in lines if line.lstrip().startswith(_REMARKS)]
     rows = [(number, line) for number, line in lines if not line.lstrip().startswith(_REMARKS)]
     announced = rows[0][1][4:5] if rows and rows[0][1].lower().startswith("sep=") else ""  # as Excel writes it

@@ -10,7 +10,7 @@ MOST_SHARE = 0.7  # of the readings: with a larger share of distinct values, no 
 
 
 def encoder_step(position: Array) -> float | None:
-    """Largest step that divides all differences between readings (samples,), in the readings' unit; otherwise None."""
+    """Largest step that divides all differences between readings (samples,), in their unit; None if there is none."""
     finite = position[np.isfinite(position)]
     if finite.size < FEWEST:
         return None

@@ -74,7 +74,7 @@ def said(columns: Columns, table: Table) -> str:
 
 
 def _described(kind: str, names: Sequence[str], columns: Columns, table: Table) -> str:
-    """The columns' names, with their units if the header does not state them."""
+    """The columns' names; if the header states no unit, with the configured or the assumed one."""
     given = getattr(columns, f"{kind}_unit", None)
     if given is not None:
         return f"{', '.join(names)} [{given}]"
@@ -156,7 +156,7 @@ def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
     seen = f"several are candidates ({', '.join(some[:12])})" if some else "none has a recognisable name"
     return CsvError(
         f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Specify them in --config ARM.toml "
-        f'(in Python: config="ARM.toml"), for example, if these are the right ones:\n{_example(table)}'
+        f'(in Python: config="ARM.toml"). For example, if these are the right ones:\n{_example(table)}'
     )
 
 
@@ -186,7 +186,7 @@ def _quoted(name: str) -> str:
 
 
 def _kind(name: str, words: str) -> str:
-    """The kind of column that a name suggests: "other" if certainly not needed, "unknown" if the name is unclear."""
+    """The kind of column that a name suggests: "other" for one that is certainly not needed, "unknown" if unclear."""
     if _TIME.fullmatch(_last(name)):
         return "time"
     found = next((kind for kind, pattern in _KINDS.items() if pattern.search(words)), "unknown")

@@ -114,7 +114,7 @@ def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
     if not found:
         what = ", ".join(sorted(refused)) or "no messages"
         raise CsvError(
-            f"{path} holds nothing that can be decoded here: {what}. Readable: JSON and, with "
+            f"{path} holds nothing that can be decoded here: {what}. hil reads JSON and, after "
             "pip install 'hil[recordings]', ROS 2 (cdr)."
         )
 
@@ -131,7 +131,7 @@ def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Any] | None:
 
 
 def _stamp(message: Any, log_time: int) -> int:
-    """Time stamp in the message's header, otherwise its log time [ns since 1970]."""
+    """Time stamp in a message's header or, if there is none, the message's log time [ns since 1970]."""
     stamp = _get(_get(message, "header"), "stamp")
     seconds, nanoseconds = _get(stamp, "sec"), _get(stamp, "nanosec")
     if isinstance(seconds, int) and isinstance(nanoseconds, int) and (seconds or nanoseconds):

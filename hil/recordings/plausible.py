@@ -1,4 +1,4 @@
-"""Rejection of angles that no servo arm reaches: most often they are in degrees, although the file does not say so.
+"""Rejection of angles that no servo arm reaches: most often, they are in degrees but not declared as such.
 
 Joints that rotate continuously are accepted, and so is everything if [columns] states the unit.
 """

@@ -41,7 +41,7 @@ class Rate:
 def rates(table: Table, time: Array, position: Array) -> tuple[Rate, ...]:
     """Compare the velocity columns with `position` (joints, rows) [rad] at `time` (rows,) [s].
 
-    Returns () unless there is one such column per joint, and each follows its joint.
+    Returns () unless there is one velocity column per joint, and each follows the motion of its joint.
     """
     columns = _columns(table)
     if len(columns) != len(position):
@@ -65,14 +65,14 @@ def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
     if len(found) > 1 and len(wrong) == len(found) and max(factors) < (1.0 + APART) * min(factors):
         factor = float(np.mean(factors))
         return (
-            f"The velocity columns are {factor:.3g} times the rates at which the positions change: the times, or "
-            f"both velocities, have a wrong scale. If times are {factor:.3g} times too long, inertias are "
+            f"The velocity columns are {factor:.3g} times the rates at which the positions change: either the times "
+            f"or both velocities have a wrong scale. If times are {factor:.3g} times too long, inertias are "
             f"{factor**2:.3g} times too large: check the unit of time and the sample rate. If only the "
             "velocities have another unit, leave these columns out: nothing else uses them.",
         )
     return tuple(
         f"Column {found[joint - 1].column!r} is {factors[joint - 1]:.3g} times the rate at which the position of joint "
-        f"{joint} changes: that velocity, the angle of joint {joint}{' or time' if len(found) == 1 else ''} has a "
+        f"{joint} changes: that velocity or the angle of joint {joint}{' (or time)' if len(found) == 1 else ''} has a "
         "wrong scale. Check units, gear ratio and sample rate."
         for joint in wrong
     )

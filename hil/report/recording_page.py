@@ -43,7 +43,7 @@ def write_recording_report(folder: Path, out: Path | None = None) -> Path:
 
 
 def recording_figures(folder: Path) -> list[Figure]:
-    """All figures of that report, in order."""
+    """All figures of the report of a recording folder, in order."""
     return figures_in(_sections(_load(folder)))
 
 
@@ -128,7 +128,7 @@ def _next(shown: _Shown) -> Section:
 def _provenance(shown: _Shown) -> Section:
     record = shown.record
     rows = [
-        ("configuration", record.config or "none: taken from the columns' names"),
+        ("configuration", record.config or "none; the column names determined how the file was read"),
         ("estimated", record.started),
         *(("file", f"{file.path}{f', SHA-256 {file.sha256[:16]}' if file.sha256 else ''}") for file in record.files),
         ("method", shown.result.method),

@@ -110,7 +110,7 @@ class Confounded:
 
 @dataclass(frozen=True)
 class Levels:
-    """RMS of all spectral lines together, per joint, in encoder steps."""
+    """Sizes of signal, distortion, noise and errors: RMS over all spectral lines, per joint, in encoder steps."""
 
     excited_lines: PerJoint
     distortion: PerJoint
@@ -140,7 +140,7 @@ class LineLevels:
 
     @property
     def groups(self) -> dict[str, LineGroup]:
-        """The available groups, by kind."""
+        """The groups of spectral lines that are available, by kind."""
         kinds = {"excited": self.excited, "odd": self.odd, "even": self.even, "other": self.other}
         return {kind: group for kind, group in kinds.items() if group is not None}
 
@@ -301,8 +301,9 @@ class PhysicalQuantity(Quantity):
 
 @dataclass(frozen=True)
 class Physical:
-    """Masses, centres of mass and inertias, derived with [known]. not_told_apart: groups of quantities that cannot be
-    separated unless another quantity is known.
+    """Masses, centres of mass and inertias, derived with the help of [known].
+
+    not_told_apart: groups of quantities that cannot be separated unless another quantity is known.
     """
 
     quantities: Mapping[str, PhysicalQuantity]
@@ -320,7 +321,7 @@ class StabiliserShare:
 
     @property
     def share(self) -> PerJoint:
-        """RMS of the stabiliser relative to that of the total torque, per joint; can exceed 1."""
+        """RMS of the stabiliser's torque relative to that of the total torque, per joint; can exceed 1."""
         return tuple(rms / max(whole, 1e-12) for rms, whole in zip(self.rms, self.commanded_rms, strict=True))
 
     def said(self, names: Sequence[str]) -> str:

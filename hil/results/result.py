@@ -147,7 +147,7 @@ class ShootingResult(Result):
 
 
 def result_from_json(value: Mapping[str, Any]) -> Result:
-    """Convert an object of the form of result.json to a result. Raises FormError."""
+    """Convert the contents of a result.json to a result. Raises FormError."""
     fit = value.get("fit")
     shooting = isinstance(fit, dict) and "residual_rms_rad" in fit
     kind: type[Result] = ShootingResult if shooting else SettledResult

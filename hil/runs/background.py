@@ -40,7 +40,7 @@ class Background(Generic[_Item]):
             self._queue.put(item)
 
     def close(self, patience: float) -> list[_Item]:
-        """Wait up to `patience` [s] until all items are processed. Returns the unprocessed items in order."""
+        """Wait up to `patience` [s] for all items to be processed. Returns the unprocessed items in order."""
         self._queue.put(None)
         self._thread.join(patience)
         if not self._thread.is_alive():

@@ -34,7 +34,7 @@ def check_archive(path: Path) -> None:
     if claimed > MOST_ARCHIVE_BYTES or claimed > 2**20 + MOST_COMPRESSED * packed:
         raise RunFolderError(
             f"{path} would take {claimed / 2**20:.0f} MB of memory; a settled period takes at most "
-            f"{MOST_ARCHIVE_BYTES / 2**20:.0f} MB. It is not a file written by hil and was not read."
+            f"{MOST_ARCHIVE_BYTES / 2**20:.0f} MB. The file was not written by hil, and was not read."
         )
 
 

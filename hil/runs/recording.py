@@ -48,8 +48,8 @@ def sample_type(joints: int) -> np.dtype[np.void]:
 
     It contains times [s], phase, segment and period of the experiment, and, for each joint, goal and measured current
     [A], velocity [rad/s], position [rad], the servo's error byte and whether its reply is missing (the measured values
-    are then NaN). A few times a second, it also contains, alternately, the servo's clock [s] or its supply voltage
-    [V] and temperature [degrees C]; these are NaN in all other rows.
+    are then NaN). A few times a second, it also contains either the servo's clock [s] or its supply voltage [V] and
+    temperature [degrees C], in turn; these are NaN in all other rows.
     """
     each = (joints,)
     return np.dtype(
@@ -183,8 +183,8 @@ class Recorder:
         except OSError as error:
             return RunFolderError(f"{said}, and its samples cannot be saved to a new file: {error.strerror}.")
         return RunFolderError(
-            f"{said}. Its {self.count} samples have been saved again in {folder}, with the configuration as it was "
-            "when the recording began."
+            f"{said}. The run's {self.count} samples have been saved again in {folder}, with the configuration as it "
+            "was when the recording began."
         )
 
     def _touch(self, first: int) -> None:
@@ -210,7 +210,7 @@ def _small_files(path: Path) -> dict[str, bytes]:
 
 
 def _cut(path: Path, samples: NDArray[np.void], count: int) -> NDArray[np.void]:
-    """Truncate the file to `count` rows in place, which needs no copy and no further disk space."""
+    """Truncate the file to `count` rows in place, without a copy or further disk space."""
     header = _header(samples.dtype, count, _header_size(path))
     with path.open("r+b") as file:
         # In this order the file is always a valid recording: rows beyond the header's count are ignored.

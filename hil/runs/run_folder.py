@@ -51,7 +51,7 @@ _PACKAGES = ("numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
 
 
 def taken(path: Path) -> RunFolderError:
-    """Return the error for a folder that is not empty; its message suggests an unused one."""
+    """Return the error for a folder that is not empty; its message suggests an unused name."""
     free = next(found for number in count(2) if not (found := path.with_name(f"{path.name}-{number}")).exists())
     return RunFolderError(
         f"Run folder {path} is not empty; choose another (--out, or out= in Python), for example {free}, or remove it."
@@ -167,7 +167,7 @@ class RunFolder:
         if (path / "recordings.npz").is_file():
             raise RunFolderError(
                 f"{path} is an estimate from another tool's recordings, but a run of hil identify or hil record "
-                "is needed here. hil.load_model and hil export read the arm from it."
+                "is needed here. hil.load_model and hil export accept an estimate, too."
             )
         if steps := steps_of(path):
             raise RunFolderError(only_steps(path, steps))
@@ -185,7 +185,7 @@ class RunFolder:
         return self.path / "config.toml"
 
     def own_files(self) -> frozenset[str]:
-        """Names of the files that make up the run: those that a run or an estimate writes, and its arm descriptions."""
+        """Names of the files that make up the run: those of the run, of an estimate and of the arm's description."""
         own = _OF_A_START | {"result.json", "lateness.json", "recordings.npz"}
         with suppress(RunFolderError, ConfigError):
             own |= {urdf.name for urdf in _urdfs(self.load_config())}
@@ -357,7 +357,7 @@ class RunFolder:
 
 
 def _urdfs(config: Config) -> set[Path]:
-    """URDF files named by the configuration; a copied configuration finds them in its own folder."""
+    """URDF files that the configuration names; a copy of the configuration finds them in its own folder."""
     chain = None if config.fake is None else config.fake.chain
     named = [config.arm.urdf, None if chain is None else chain.urdf]
     return {Path(each) for each in named if each is not None}

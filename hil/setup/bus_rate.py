@@ -21,8 +21,8 @@ from hil.setup.realtime import on_time
 CYCLES = 200
 SLOW_EVERY = 10
 USUAL = 0.9
-"""Fraction of the exchanges that must be fast enough for the reported rate; an experiment needs 80 % of them on
-time.
+"""Fraction of the exchanges that must be fast enough for the reported rate; an experiment needs 80 % of its
+exchanges on time.
 """
 PATIENCE_S = 0.05
 """Time after which a reply counts as lost [s]; on a busy computer the kernel may deliver a reply 10 to 20 ms late."""
@@ -38,8 +38,8 @@ RATE_MARGIN = 1.2
 class ExchangeMode:
     """Measured timing of one exchange mode.
 
-    median_s, longest_s: round trips [s]. usual_s, slowest_s: times that 90 % and half of the exchanges with the slowest
-    kind of read do not exceed [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
+    median_s, longest_s: round trips [s]. usual_s, slowest_s: 90 % quantile and median of the round trips with the
+    slowest kind of read [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
     """
 
     one_write: bool

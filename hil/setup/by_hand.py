@@ -123,7 +123,7 @@ def _reversed(joint: JointConfig) -> list[int] | int:
 
 
 def _unlike(joint: JointConfig, drives: Array) -> str:
-    """Return a message if a joint's two servos do not turn as their directions describe, otherwise ""."""
+    """Return a message if the motion of a joint's two servos contradicts their configured directions, otherwise ""."""
     if len(joint.ids) == 1 or abs(drives[1] - drives[0]) <= SEVERAL * abs(drives[0]):
         return ""
     first, second = joint.ids
@@ -138,7 +138,7 @@ def _unlike(joint: JointConfig, drives: Array) -> str:
 
 
 def _awaited(read: Read, clock: Clock, before: Array) -> Array:
-    """Return all joints' displacements once one has been moved by hand and is held still; near zero after a timeout."""
+    """Return all joints' displacements once a joint has been moved by hand and held still, or after a timeout."""
     end = clock.now() + PATIENCE_S
     held_since, last = clock.now(), before
     while clock.now() < end:

@@ -15,7 +15,7 @@ __all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "may_be_later
 
 _MODE, _DELAY = "Operating Mode", "Return Delay Time"
 _GOAL_PWM = "Goal PWM"
-"""Register that limits the voltage in current mode. After the watchdog has tripped, its value of 0 proves nothing."""
+"""Register that limits the voltage in current mode. After the watchdog has tripped, a value of 0 proves nothing."""
 
 _BESIDE = frozenset({*PROTECTIVE, STATUS_LEVEL}) - {SECONDARY_ID}
 """Settings that cannot explain a stop (except a Status Return Level of 0) but are named along with others that can."""
@@ -54,7 +54,7 @@ _MOVED = frozenset(
         Cause.EARLY_MOTION,
     }
 )
-"""Causes of a stop that a change of settings other than Return Delay Time can explain."""
+"""Causes of a stop that changed settings other than Return Delay Time can explain."""
 
 EXPLAINED = _MOVED | _LATE
 
@@ -114,7 +114,7 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
 
 
 def _swapped(before: Settings, after: Settings) -> tuple[Joint, Joint] | None:
-    """Return a servo that now has all the settings of another, and that other servo; None if there is no such pair."""
+    """Return a servo that now has all the settings that another had, and that other servo; None if there is no pair."""
     old, new = _by_joint(before), _by_joint(after)
     for first, second in permutations(old, 2):
         if old[first] != old[second] == new.get(first):

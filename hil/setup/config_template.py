@@ -21,7 +21,7 @@ RATES = (400, 300, 250, 200, 160, 125, 100, 80, 64, 50, 40, 32, 25, 20)
 class JointAnswers:
     """Answers about one joint.
 
-    rest: angle at rest [rad]. swing: allowed deviation from it to either side [rad]. length: distance from this joint
+    rest: angle at rest [rad]. swing: allowed deviation from rest to either side [rad]. length: distance from this joint
     to the next one, or to the tip [m]. voltage: supply voltage of its servo [V]; None if it was not read.
     """
 
@@ -59,8 +59,8 @@ class MeasuredBus:
 class ArmAnswers:
     """Answers about one arm.
 
-    gravity: component of gravity in the plane of the arm [m/s^2]. head: comment at the top of the file. measured: None
-    if the bus was not measured; the sample rate then follows from the baud rate.
+    gravity: component of gravity in the plane of the arm [m/s^2]. head: comment at the top of the file. measured:
+    result of measuring the bus; without it, the sample rate follows from the baud rate.
     """
 
     url: str
@@ -108,7 +108,7 @@ def arm_toml(arm: ArmAnswers) -> str:
     ]
     if len(arm.joints) == 2:
         model.append(_line("torque_scale = true", "estimates the second torque constant relative to the first"))
-    safety = ["[safety]", _line("watchdog = 0.08", "s without packets after which a servo stops by itself")]
+    safety = ["[safety]", _line("watchdog = 0.08", "s, time without packets after which a servo stops by itself")]
     tables = [head, port, *(_joint(joint) for joint in arm.joints), mechanism, experiment, model, safety]
     return "\n\n".join("\n".join(table) for table in tables) + "\n"
 

@@ -33,7 +33,7 @@ _POSE = {
 
 
 def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) -> ArmAnswers:
-    """Ask about the arm on an open port, given the result of a scan. Raises ExperimentError if no arm can be formed."""
+    """Ask about the arm on an open port, given the result of a scan. Raises ExperimentError if no arm is usable."""
     baud, servos = _one_baud(heard)
     port.set_baud(baud)
     chosen = _choose(servos, ask, say)
@@ -157,7 +157,7 @@ def _name(number: int, found: Found, ask: Ask) -> str:
 def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
     """Determine in which direction Present Position increases; return +1 if counter-clockwise, otherwise -1.
 
-    This is as seen by a viewer for whom the hanging arm points to the right when it is lifted.
+    The viewer is on the side from which the hanging arm, once lifted, points to the right.
     """
     before = servo.read("Present Position")
     given = {"1": 1, "+1": 1, "-1": -1}

@@ -20,10 +20,10 @@ AFTER_A_RUN = 2.0
 """
 
 NEAR_RAD = 0.02
-"""Largest deviation at which arm.rest_pose is still used even if the arm is not exactly in it [rad]."""
+"""Largest deviation from arm.rest_pose at which it is still used as the rest pose [rad]."""
 
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
-"""Smallest reported motion after torque is cut, and largest deviation from the rest pose before that motion [rad]."""
+"""Smallest motion after torque is cut that is reported, and largest deviation from the rest pose before it [rad]."""
 
 _LONGEST_SAG_S = 3.0  # wait for an arm that moves after torque off
 
@@ -39,7 +39,7 @@ def tolerance_now(config: Config) -> float:
 
 
 def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
-    """Wait at most `longest` [s] for an arm that is still swinging or falling after an earlier run.
+    """Wait at most `longest` [s] for an arm that is still swinging or falling after an earlier run to come to rest.
 
     Returns a sentence naming a joint that is still moving after that time; "" if all are at rest. Raises BusShared if
     another program switches torque on in the meantime.
@@ -88,7 +88,7 @@ def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float])
 
 
 def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
-    """Return the configuration with the measured pose (joints,) [rad], clipped to position_limit, as rest pose.
+    """Return the configuration with the measured pose (joints,) [rad], clipped to position_limit, as its rest pose.
 
     The configuration is returned unchanged if the two poses hardly differ, or if they differ so much that the run will
     be refused.
@@ -104,7 +104,7 @@ def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
 
 
 def said_of_the_rest(config: Config, lies: Config) -> str:
-    """Return a message that states that the arm does not lie in its rest pose and gives its actual angles."""
+    """Return a sentence saying that the arm does not lie in its rest pose, with its actual angles."""
     each = zip(config.joints, lies.arm.rest_pose, config.arm.rest_pose, strict=True)
     away = [
         f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})"

@@ -14,7 +14,7 @@ _AT_ONCE_S = 0.005
 def others_on_the_bus(bus: ServoBus) -> list[str]:
     """Describe each servo at this baud rate that is not part of the arm.
 
-    Raises PortLost, or WrongSetting if one of them obeys commands to a servo of the arm.
+    Raises PortLost, or WrongSetting if one of them obeys commands meant for a servo of the arm.
     """
     ours = {drive.id for drive in bus.drives}
     heard = listen(bus.port) if isinstance(bus.port.clock, WallClock) else listen(bus.port, _AT_ONCE_S)

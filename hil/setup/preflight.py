@@ -101,7 +101,7 @@ def _torque_of_pilot(config: Config) -> Iterator[Finding]:
 
 
 def _path(config: Config) -> Iterator[Finding]:
-    """Report a spatial arm's path that a run without a pilot would refuse."""
+    """Report whether a run without a pilot would refuse the path of a spatial arm."""
     if why := missing_path(config):
         yield Finding(Level.STOP, "experiment", "path", "joint_path is missing", why)
         return
@@ -128,7 +128,7 @@ def _described(config: Config) -> Iterator[Finding]:
     except ConfigError as error:
         yield Finding(Level.STOP, "arm", "rest pose", "not clear", str(error))
         return
-    yield Finding(Level.OK, "arm", "rest pose", "clear of itself, the floor and the boxes")
+    yield Finding(Level.OK, "arm", "rest pose", "no part touches another part, the floor or a box")
     if not config.experiment.pilot:
         yield from _path(config)
 
@@ -161,7 +161,7 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
         found = others_on_the_bus(bus)
     except WrongSetting as error:
         yield Finding(
-            Level.STOP, config.port.url, "other servos on this bus", "one obeys commands to this arm", str(error)
+            Level.STOP, config.port.url, "other servos on this bus", "one obeys commands meant for this arm", str(error)
         )
         return
     except DriverError as error:
@@ -204,8 +204,8 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
             return
         except DriverError as error:
             fix = (
-                f"{error} It answers pings: if it never answers reads, its Status Return Level is 0; power-cycle "
-                "it to reset that level to 2."
+                f"{error} The servo answers pings: if it never answers reads, its Status Return Level is 0; "
+                "power-cycle it to reset that level to 2."
             )
             yield Finding(Level.STOP, where, "registers", "cannot be read", fix)
             return
@@ -236,7 +236,7 @@ def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding
         yield Finding(Level.WARNING, str(joint), what, "cannot be restored", str(error))
         return
     if written := ", ".join(restored.written):
-        yield Finding(Level.OK, str(joint), what, f"it ended before it could restore them; restored now: {written}")
+        yield Finding(Level.OK, str(joint), what, f"that run ended before restoring them; restored now: {written}")
     if restored.others:
         yield Finding(
             Level.WARNING,
@@ -257,7 +257,7 @@ def _graded(fine: bool, what: str, found: str, fix: str, otherwise: Level = Leve
 
 def _firmware(_config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
     firmware, needed = servo.read("Firmware Version"), joint.servo.watchdog_firmware
-    fix = f"The Bus Watchdog needs {needed} or newer: update it with DYNAMIXEL Wizard 2.0."
+    fix = f"The Bus Watchdog needs firmware {needed} or newer: update the servo with DYNAMIXEL Wizard 2.0."
     return _graded(firmware >= needed, "firmware", str(firmware), fix)
 
 
@@ -290,7 +290,7 @@ def _drive_mode(config: Config, _joint_config: JointConfig, _joint: Joint, servo
     )
     if drive_mode & 1:
         fix += (
-            f" Then `direction` and zero_ticks are no longer valid: determine them again, with {_finds_zeros(config)}."
+            f" After that, `direction` and zero_ticks are no longer valid: determine them with {_finds_zeros(config)}."
         )
     return _graded(unsuitable_drive_mode(servo) is None, "drive mode", str(drive_mode), fix)
 
@@ -418,12 +418,12 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     ticks = servo.read("Present Position")
     index = [joint.id in each.ids for each in config.joints].index(True)
     if joint.id != config.joints[index].id:
-        found = f"read from the first servo (ID {config.joints[index].id}); only motion shows this servo's direction"
+        found = f"read from servo ID {config.joints[index].id}; this servo's direction shows only when the joint moves"
         return Level.OK, "pose", found, ""
     angle = within_limits(joint.within_turn(ticks).angle(ticks), config.joints[index].position_limit)
     rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
-    fix = f"arm.rest_pose is {rest:.3f} rad; arm.rest_tolerance allows {config.rest_tolerance:g}. " + rest_pose_hint(
+    fix = f"arm.rest_pose is {rest:.3f} rad; arm.rest_tolerance allows +-{config.rest_tolerance:g}. " + rest_pose_hint(
         angle, rest, config.rest_tolerance, zero
     )
     return _graded(abs(angle - rest) <= config.rest_tolerance, "pose", f"{angle:+.3f} rad", fix)

@@ -22,8 +22,8 @@ _PATIENCE_S = _SLOT_S * (MAX_ID + 1)
 _STATUS_BYTES = 14
 
 _DIFFERENT = ("Present Position", "Realtime Tick")
-"""Registers that differ between any two servos. If two servos have the same ID, equal replies merge into one, but
-different ones corrupt each other.
+"""Registers whose values differ between any two servos. If two servos have the same ID, equal replies merge into one,
+but different ones corrupt each other.
 """
 
 

@@ -45,9 +45,10 @@ def refuse_moved(before: Lies, now: Lies, bus: ServoBus) -> None:
             again = _turned(drive, before, {drive: bus.drives[drive].read("Present Position")})
             if abs(again) <= MOST_RAD < abs(turned - again):
                 raise ExperimentError(
-                    f"{drive.title} reported an angle {turned:+.3f} rad from the first one, and {again:+.3f} rad when "
-                    "it was read again: its replies come one request late, or it was moved and moved back. Unplug the "
-                    "adapter, plug it in and start again; if this recurs, replace the adapter or its cable."
+                    f"{drive.title} reported an angle that differed from the first one by {turned:+.3f} rad, and by "
+                    f"{again:+.3f} rad when read again: its replies come one request late, or it was moved and moved "
+                    "back. Unplug the adapter, plug it in and start again; if this recurs, replace the adapter or its "
+                    "cable."
                 )
             raise ExperimentError(
                 f"{drive.title} has turned by {turned:+.3f} rad since this command first read its angle, before "

@@ -115,7 +115,7 @@ class _Flight(Generic[Item, Result]):
         return futures
 
     def end(self, key: str, result: Any, *, lost: bool) -> tuple[list[Any], list[Ended[Item, Result]]]:
-        """Futures of jobs to be repeated, and the jobs that have ended."""
+        """Futures of the jobs that are repeated, and the jobs that have ended."""
         jobs = self._tasks.pop(key)
         if lost and len(jobs) > 1:
             return self._submit([[job] for job in jobs]), []  # one of them kills its worker
@@ -154,7 +154,7 @@ def each(
 
     Args:
         function: as for `run_jobs`.
-        items: its arguments.
+        items: the argument of each call.
         count: number of workers; one per core unless given; 0 computes in this process.
         scheduler: as for `hil.study.engine.workers`.
         tell: called with each result as it arrives.

@@ -181,7 +181,7 @@ def _done(spec: Spec, folder: Path) -> Any:
 
 @contextmanager
 def _place(spec: Spec) -> Iterator[Path]:
-    """The folder of a run, removed afterwards unless it is to be kept; hil's user state folder is inside it."""
+    """The folder of a run, removed afterwards unless `spec.keep_in` names it; hil's user state is always removed."""
     with tempfile.TemporaryDirectory(prefix="hil-study-", dir=_scratch(), ignore_cleanup_errors=True) as scratch:
         folder = Path(spec.keep_in) if spec.keep_in else Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)

@@ -57,8 +57,8 @@ def test_every_reader_says_what_is_wrong(
         ("[a]\nx = 1\nx = [\n  1,\n]\n", "x is given twice in [a], on lines 2 and 3."),
         ('[a]\ny = """\nx = 1\n[b]\n"""\nx = 1\nx = 2\n', "x is given twice in [a], on lines 6 and 7."),
         ("[[a]]\n[a.b]\nx = 1\n[[a]]\n[a.b]\nx = 1\nx = 2\n", "x is given twice in [a.b], on lines 6 and 7."),
-        ("[a]\nb = 1\n[[a]]\n", "line 1 has [a] and line 3 [[a]]. Write [[a]], with two brackets"),
-        ("[[x]]\na = 1\n[x]\na = 1\n", "line 3 has [x] and line 1 [[x]]. Write [[x]], with two brackets"),
+        ("[a]\nb = 1\n[[a]]\n", "line 1 has [a] and line 3 has [[a]]. Write [[a]], with two brackets"),
+        ("[[x]]\na = 1\n[x]\na = 1\n", "line 3 has [x] and line 1 has [[x]]. Write [[x]], with two brackets"),
     ],
 )
 def test_what_is_given_twice_is_named_with_both_lines(text: str, said: str, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Stage 1 for chains: linear least squares on the Fourier lines of settled periods, with a weak prior.
+"""Stage 1 for chains: linear least squares on the Fourier coefficients of settled periods, with a weak prior.
 
 It works like `hil.estimator.fit.stage1`, with the chain's regressor. Base parameters that the motion does not determine
 come from the prior.
@@ -31,7 +31,7 @@ class ChainLinear:
     delay: float
     """Delay of the motor torque [s]."""
     motions: tuple[PeriodicMotion, ...]
-    """Motion of each period, computed from its Fourier lines."""
+    """Motion of each period, computed from its Fourier coefficients."""
     relative_residual: Array
     """RMS of the torque residual relative to that of the torque (joints,)."""
 

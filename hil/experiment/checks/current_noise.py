@@ -88,7 +88,7 @@ class NoiseAllowance:
     """Adapts the joints' thresholds to the noise of their current readings.
 
     records: the joints' records (`joint_checks.JOINT`), whose thresholds are set whenever the noise becomes better
-    known. planned: largest goal of each joint [A, or V under PWM]. interval: time between two exchanges [s].
+    known. planned: largest goal of each joint [A, or V in PWM mode]. interval: time between two exchanges [s].
     noise: noise of each joint's readings [A or V]; None if not known.
     """
 

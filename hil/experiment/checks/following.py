@@ -106,8 +106,8 @@ differs_for, differs: duration [s] and number of samples of a deviation.
 def begin(memory: Any, goals: Any, joint: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
     """Set the constants of `memory` and `goals`, zero-filled records.
 
-    planned: the joint's largest goal [A, or V under PWM]. follow_share, follow_time: the [safety] settings of the same
-    names.
+    planned: the joint's largest goal [A, or V in PWM mode]. follow_share, follow_time: the [safety] settings of the
+    same names.
     """
     memory["share"] = follow_share
     memory["follow_time"] = follow_time

@@ -66,7 +66,7 @@ class Lowering:
     """Computes the goals on the path to the rest pose. Created before torque is switched on; call `begin` when a stop
     occurs.
 
-    interval: time between two exchanges [s]; by default, that between two samples.
+    interval: time between two exchanges [s]; by default, the sample period.
     """
 
     def __init__(self, config: Config, plan: Plan, interval: float | None = None) -> None:

@@ -33,7 +33,7 @@ class Stopped(NamedTuple):
     """State of a stream when it was stopped.
 
     latest, whole: the latest state, and the latest one with replies from all servos; None if there is none. goal:
-    latest goals [A, or V under PWM]. sent_at: when they were sent [s]. segment: index of the multisine being played.
+    latest goals [A, or V in PWM mode]. sent_at: when they were sent [s]. segment: index of the multisine being played.
     """
 
     latest: State | None

@@ -40,9 +40,9 @@ def friction(data: RunData) -> Section | None:
 
 
 def _left_to_friction(model: ArmModel, period: PlayedPeriod, lines: Lines, harmonics: int) -> tuple[Array, Array]:
-    """Speeds [rad/s] and friction torques [N m], both (joints, dots), from the Fourier lines of a motion.
+    """Speeds [rad/s] and friction torques [N m], both (joints, dots), from the Fourier coefficients of a motion.
 
-    harmonics: the highest line used; the same for both motions, so that they are smoothed equally.
+    harmonics: the highest harmonic used; the same for both motions, so that they are smoothed equally.
     """
     samples = period.position.shape[1]
     motion = motion_of(lines, harmonics, 2 * np.pi * period.rate / samples, samples)

@@ -30,7 +30,7 @@ def provenance(data: RunData) -> Section:
 
 def _excitation(entry: Excitation, names: list[str]) -> tuple[str, str]:
     each = "; ".join(
-        f"{name}: {len(found)} lines, crest factor {factor:.2f}"
+        f"{name}: {len(found)} spectral lines, crest factor {factor:.2f}"
         for name, found, factor in zip(names, entry.lines, entry.crest_factor, strict=True)
     )
     return f"excitation, {entry.role.replace('_', ' ')}", each

@@ -28,9 +28,10 @@ def spectra(data: RunData) -> Section | None:
         return None
     excited = _excited(data)
     words = (
-        "Each joint has its own lines, so that the coupling between the joints can be separated. The response between "
-        "and above the excited lines comes from the arm's nonlinearity, mainly friction: the model must explain it "
-        "too, and it contains information about the parameters. This response should be well above the noise.",
+        "Each joint has its own spectral lines, so that the coupling between the joints can be separated. The response "
+        "between and above the excited lines comes from the arm's nonlinearity, mainly friction: the model must "
+        "explain it too, and it contains information about the parameters. This response should be well above the "
+        "noise.",
     )
     pictures = [_excitation(data, data.fitted, excited)]
     pictures += [_response(data.fitted, joint, name, excited) for joint, name in enumerate(data.names)]
@@ -38,7 +39,7 @@ def spectra(data: RunData) -> Section | None:
 
 
 def _levels(data: RunData) -> tuple[Table, ...]:
-    """Table of RMS motion and residual per line, by kind of line; empty for older results, which lack these values."""
+    """Table of RMS motion and residual per spectral line, by kind of line; empty for older results, which lack them."""
     levels = data.result.validation.line_levels_ticks
     if levels is None:
         return ()
@@ -49,7 +50,7 @@ def _levels(data: RunData) -> tuple[Table, ...]:
     ]
     rows += [(f"noise, {name}", "", steps(levels.noise[joint]), "") for joint, name in enumerate(data.names)]
     head = ("lines", "number", "motion per line [steps]", "model residual [steps]")
-    return (Table(head, tuple(rows), caption="RMS per line, by kind"),)
+    return (Table(head, tuple(rows), caption="RMS per spectral line, by kind"),)
 
 
 def _excited(data: RunData) -> list[list[int]]:

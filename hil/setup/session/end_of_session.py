@@ -19,7 +19,7 @@ _NEVER_ON = "Torque is off on all servos, confirmed by reading it back; this com
 
 
 def end_with(bus: ServoBus, stopped: BaseException | None, left: Sequence[str], before: TorqueOff | None) -> None:
-    """Add the remaining messages to the exception that ended the block, or raise another if that one no longer applies.
+    """Add the remaining messages to the exception that ended the block; if it no longer applies, raise another instead.
 
     before: the report on torque before the settings were restored; None if this command had not switched torque on.
     """

@@ -158,7 +158,7 @@ class ServoSession:
             for (joint, name), (found, restored) in saved.undone.items()
             if joint not in failed
         ]:
-            self._say(f"What another program had changed has been restored ({'; '.join(told)}).")
+            self._say(f"Settings that another program had changed have been restored ({'; '.join(told)}).")
         saved.forget(joint for joint in saved.kept if joint not in failed)
         for joint, error in failed.items():
             if isinstance(error, TorqueDoubted):
@@ -168,7 +168,7 @@ class ServoSession:
     def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
         """Cut torque where it is on and restore these servos' settings; return whether there was anything to do.
 
-        If torque has been switched on again before, it is watched for WATCH_S: a single reading may come too early.
+        If torque has been switched on again before, watch it for WATCH_S: a single reading may come too early.
 
         failed: receives the errors of the servos whose settings could not be restored.
         """
@@ -211,7 +211,7 @@ _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=N
 
 @contextmanager
 def servo_session(config: Config, folder: Path | None = None, say: Say = to_stderr) -> Iterator[ServoBus]:
-    """Open the bus with every servo in its mode and torque off, prepared for exchanges; restore settings at the end.
+    """Open the bus, ready for exchanges, with torque off and every servo in its mode; restore settings at the end.
 
     Raises ExperimentError at the end if a setting could not be restored and no other error has ended the block.
 
@@ -259,7 +259,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
 def _end(session: ServoSession, stopped: BaseException | None) -> None:
     """Restore the settings, and report what could not be restored with the exception that ends the session.
 
-    A signal that arrives meanwhile ends the session in place of `stopped`, with the same notes.
+    If a signal arrives meanwhile, its exception ends the session in place of `stopped`, with the same notes.
     """
     bus, before = session.bus, session.bus.torque_off_report
     left: list[str] = []

@@ -1,4 +1,4 @@
-"""Report settings that differ from those before the session although all have been restored as far as possible."""
+"""Report settings that could not be restored to their values before the session."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
