@@ -70,7 +70,7 @@ def without_jump(position: Array) -> Array:
 
 
 def slow_part(position: Array, lines: int) -> Array:
-    """Return the part of a period (joints, samples) that its first `lines` Fourier coefficients describe, as samples."""
+    """Return the part of a period (joints, samples) described by its first `lines` Fourier coefficients, as samples."""
     kept = np.fft.rfft(position, axis=1)
     kept[:, lines:] = 0.0
     return np.asarray(np.fft.irfft(kept, position.shape[1], axis=1))

@@ -1,8 +1,8 @@
 """Fit of a model with given terms, including two searches for the periods of its ripple and cogging.
 
 The regression on Fourier coefficients (`hil.estimator.fit.ripple`) finds a wave's period if all other effects are
-modelled well. The linear regression cannot represent encoder errors, cables or narrow Stribeck friction. If these matter, the
-search may end at a wrong period. Therefore a second search starts from a fit of all other terms.
+modelled well. The linear regression cannot represent encoder errors, cables or narrow Stribeck friction. If these
+matter, the search may end at a wrong period. Therefore a second search starts from a fit of all other terms.
 """
 
 from collections.abc import Mapping, Sequence
