@@ -51,7 +51,7 @@ class _Joint:
 def local_defects(
     recordings: Sequence[Recording], names: Sequence[str], predicted: Sequence[Array], window: float
 ) -> tuple[str, ...]:
-    """One sentence for each local defect, for a fit that leaves much of the motion unexplained.
+    """One sentence for each local defect; for use if a fit leaves much of the motion unexplained.
 
     predicted: simulated positions of each recording (joints, samples) [rad]. window: length of the parts whose
     residuals are compared [s].
@@ -207,7 +207,7 @@ def _stop(joint: _Joint) -> list[str]:
             continue
         found.append(
             f"{joint.name[0].upper()}{joint.name[1:]} rebounds at {place:.4g} rad {at.size} times, {_at(time[at])}, "
-            "and never moves past it: it hits a stop or an object there, and no model includes impacts. Use the part "
+            "and never moves past it: it hits a stop or an object there, and no model covers impacts. Use the part "
             "before the first impact, or record motion that stays clear of it."
         )
     return found
