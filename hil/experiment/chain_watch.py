@@ -38,11 +38,11 @@ friction of up to twice the mean from raising an alarm.
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
 _IMPACT_S, _MOST_REBOUND = 0.05, 0.5
-"""How long a joint that has come back to its rest angle may bounce off a stop [s], and its largest speed then, relative
-to the speed before.
+"""How long a joint that has come back to its rest angle may bounce off a stop [s], and its largest speed while it
+bounces, relative to the speed before the impact.
 """
 WINDOW_S = 0.3
-"""Time span [s] of the torque range that a message about a stationary joint states."""
+"""Time span [s] for which a message about a stationary joint gives the range of torques."""
 
 
 class ChainWatch:
@@ -83,7 +83,7 @@ class ChainWatch:
         self._velocity = np.zeros(n)
         """Latest velocities (joints,) [rad/s]."""
         self._hit_at, self._hit_speed = np.full(n, -np.inf), np.zeros(n)
-        """When each joint may last have hit a stop near its rest angle [s], and its speed before [rad/s]."""
+        """When each joint may last have hit a stop near its rest angle [s], and its speed before the impact [rad/s]."""
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""

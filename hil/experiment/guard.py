@@ -47,7 +47,7 @@ may be rejecting its goals.
 """
 
 NONE_HEARD, LOST = "No servo was heard", "Requests or replies are lost"
-"""Beginnings of the explanations of a stop because no servo replies, and because one does not."""
+"""How the explanation of a stop begins if no servo replies, and if one servo does not."""
 
 
 class Guard:
@@ -134,7 +134,7 @@ class Guard:
         self._silence.woke_up(now, late)
 
     def others_answer(self) -> None:
-        """Record that some unheard servos do answer, but a silent one hides their replies."""
+        """Record that some servos that seem silent do reply, but that a silent servo hides their replies."""
         self._silence.others_answer = True
 
     def late(self, seconds: float = 0.0) -> None:
@@ -340,7 +340,7 @@ class Guard:
         # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
         shared = f"{NONE_HEARD}; requests or replies are lost: check the adapter, the cables and the supply"
         if self._silence.is_busy:
-            return f"{shared}, and whether other programs keep this computer busy: this program was running late."
+            return f"{shared}, and whether other programs keep this computer busy, since this program was running late."
         return f"{shared}."
 
     def _not_together(self, index: int, servo: int, turned: float) -> NoReturn:
