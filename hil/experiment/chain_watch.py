@@ -2,9 +2,9 @@
 
 Prior knowledge is the ensemble's mean and inflated covariance. While the arm is in its rest pose, something may support
 it, so no joint is judged. A joint that stands still at its rest angle may be lying against an end stop, so it is
-judged only by torques towards the side on which it has been. The same applies to a joint that has just come back to
-that angle, since it may have hit the stop. A joint that has not left its rest angle yet may be lying against a stop on
-the side to which gravity pulls it: it is judged only while its torque acts towards that side.
+judged only while torque acts towards the side on which it has been. The same applies to a joint that has just come back
+to that angle, since it may have hit the stop. A joint that has not left its rest angle yet may be lying against a stop
+on the side to which gravity pulls it: it is judged only while its torque acts towards that side.
 """
 
 import math

@@ -44,8 +44,8 @@ _HELD_BEFORE = 4
 
 OLD_REPLIES = (
     Cause.STALE,
-    "returns stale data: its replies do not change, or are late by its own clock. A device between adapter and servo "
-    "repeats or delays them.",
+    "returns stale data: its replies do not change, or are late according to its own clock. A device between adapter "
+    "and servo repeats or delays them.",
 )
 
 
@@ -176,8 +176,8 @@ class StatusCheck:
                 )
             if late * self._interval <= _LONGEST_DELAY_S:
                 return Cause.GOALS_LOST, (
-                    f"receives goals {cycles} late: by its own clock, its replies are recent. A device between adapter "
-                    "and servo delays requests. Check the adapter, its latency and its cable."
+                    f"receives goals {cycles} late: according to its own clock, its replies are recent. A device "
+                    "between adapter and servo delays requests. Check the adapter, its latency and its cable."
                 )
         unit = self._unit[joint]
         held = f"it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent"
@@ -255,7 +255,7 @@ class StatusCheck:
                     "Check the adapter, and that every servo has its own ID."
                 )
             return Cause.STALE, (
-                f"returns stale data: by its own clock its reply is {1e3 * abs(ahead):.0f} ms off. Replies "
+                f"returns stale data: according to its own clock, its reply is {1e3 * abs(ahead):.0f} ms off. Replies "
                 "are delayed in transit, or the servo was rebooted. Check the adapter, its latency and its cable."
             )
         least = offset if ahead < drifted else behind + drifted
