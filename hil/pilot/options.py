@@ -49,8 +49,8 @@ class PilotOptions:
     friction.
     """
     worthwhile_raise: float = 1.15
-    """Minimum ratio of the new torque to the last run's that justifies another run if little of the range is unused
-    (see `fair_share`).
+    """Minimum ratio of the new torque to that of the last run for which another run is worthwhile, if little of the
+    range is unused (see `fair_share`).
     """
     worthwhile_raise_far: float = 1.03
     """Replaces `worthwhile_raise` if much of the range is unused."""

@@ -84,8 +84,8 @@ def _stopped_or_clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
 def _clipped(recordings: Sequence[Recording], found: Sequence[Clipped]) -> tuple[str, ...]:
     return tuple(
         f"{_unsigned(recordings, each.joint)}The torque of joint {each.joint} seems to have been limited to about "
-        f"{each.level:.3g} N m; its column exceeds that in {100 * each.beyond:.2g} % of the samples. With this limit, "
-        f"inverse dynamics leaves {100 * each.residual:.2g} % of the torque unexplained instead of "
+        f"{each.level:.3g} N m; its column exceeds this value in {100 * each.beyond:.2g} % of the samples. With "
+        f"this limit, inverse dynamics leaves {100 * each.residual:.2g} % of the torque unexplained instead of "
         f"{100 * each.residual_given:.2g} %. A "
         "current limit or the supply voltage clips it (saturation): use the measured current, or smaller commands."
         for each in found

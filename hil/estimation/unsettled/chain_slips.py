@@ -26,7 +26,7 @@ def refuse_chain_slips(check: ColumnCheck | None, joints: Sequence[str], source:
         gain = "friction is positive instead of negative" if signs.impossible else unexplained(*signs.residuals)
         instead = f" (or, just as likely, {signs.instead.said(joints)})" if signs.instead else ""
         raise CsvError(
-            f"{source}: {reversal_said(signs.signs, joints)}, {gain}{instead}. Change that in the file, or correct the "
+            f"{source}: {reversal_said(signs.signs, joints)}, {gain}{instead}. Fix this in the file, or correct the "
             "axis in the description of the arm; `hil pose` shows each joint's direction."
         )
     times = check.wrong_times()

@@ -126,7 +126,7 @@ def _silent(joint: _Joint, joints: Sequence[_Joint]) -> list[str]:
     together = [each for each in joints if each.time is joint.time]
     return [
         f"The torque of {joint.name} stays at {joint.torque[part.start]:.4g} N m {_from_to(joint.time, part)}, but the "
-        "motion contradicts this: the column lacks the torque that acted there. Leave that part out."
+        "motion contradicts this: the column lacks the torque that acted at that time. Leave that part out."
         for part in _constant(joint.time, joint.torque)
         if any(each.is_unexplained(part) for each in together)
     ]

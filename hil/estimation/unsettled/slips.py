@@ -56,7 +56,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
     if _is_clear(signs.residual, signs.residual_given):
         raise CsvError(
             f"{source}: {reversal_said(signs.signs)}, {unexplained(signs.residual, signs.residual_given)}. "
-            "Change that in the file, or swap the columns."
+            "Correct this in the file, or swap the columns."
         )
     # All torques reversed leave the same residual, but nothing has a negative inertia.
     inertias = [name for name in signs.impossible if name.startswith("inertia")]
@@ -64,7 +64,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
         verb = "are" if signs.signs.are_several else "is"
         raise CsvError(
             f"{source}: {signs.signs.said()} {verb} reversed: as given, {' and '.join(inertias)} would be negative. "
-            "Change that in the file, or reverse the positions."
+            "Correct this in the file, or reverse the positions."
         )
 
 
