@@ -169,7 +169,7 @@ def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
         raise ResultError(f"{path} is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
     if unknown:
         raise ResultError(
-            f"{path} has {', '.join(unknown)}, which this version of hil does not know; a newer one wrote this file."
+            f"{path} has {', '.join(unknown)}, which this version of hil does not know; the file is from a newer one."
         )
     bad = [name for name, value in values.items() if not math.isfinite(value)]
     if bad:

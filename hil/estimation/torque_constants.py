@@ -14,7 +14,7 @@ RATIO = "torque_scale"
 USUAL_RATIO_STD = math.hypot(USUAL_TORQUE_SPREAD, USUAL_TORQUE_SPREAD)
 CONTRADICTORY = 2.0  # standard deviations, those of the torque constants and of the ratio combined
 COLUMNS_APART = 1.0
-"""Relative standard deviation assumed for the ratio of two torque columns, whose scales are unknown."""
+"""Relative standard deviation assumed for the ratio of two torque columns with unknown scales."""
 Source = Literal["constant", "column"]
 """Where a joint's torque comes from: its torque constant, or a column of a recording."""
 _STATES: dict[Source, str] = {"constant": "torque constants", "column": "torque columns"}
@@ -67,10 +67,10 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
         return " ".join(sentence for sentence in (known if unsure else "", silent) if sentence)
     first = joints[0]
     given = _capitalised(_relative(first.name, ratios, "constant"))
-    found = f"{given}. Every value scales only with the torque constant of {first.name}"
+    found = f"{given}. All values scale with the torque constant of {first.name} alone"
     if not first.torque_per_goal_std:
         return f"{found}, whose uncertainty is not given."
-    return f"{found}, known to within {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
+    return f"{found}, which is known to within {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
 
 
 def ratios_of(names: Sequence[str], value: Array, std: Array) -> dict[str, Quantity]:
@@ -106,8 +106,8 @@ def contradictions(
             continue
         found.append(
             f"The {_STATES[source]} of {joints[0]} and {joint} disagree by a factor of "
-            f"{max(value, 1.0 / value):.3g}: {_relative(joints[0], [(joint, ratio)], source)}, and torque constants "
-            f"are uncertain by only {100 * spread:.2g} % relative to each other. The values of all joints are relative "
+            f"{max(value, 1.0 / value):.3g}: {_relative(joints[0], [(joint, ratio)], source)}, whereas the ratio "
+            f"of torque constants is uncertain by only {100 * spread:.2g} %. The values of all joints are relative "
             f"to the torque of {joints[0]} and share its error: {_CHECK[source]}."
         )
     return tuple(found)

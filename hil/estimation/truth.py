@@ -43,7 +43,7 @@ def true_parameters(config: Config, time: float = math.inf) -> dict[str, float] 
 
 
 def back_emf(config: Config, fake: FakeArm, drives: Sequence[Drive]) -> dict[str, float]:
-    """Back-EMF of each voltage-driven joint as viscous friction [N m s/rad], by parameter name."""
+    """Back-EMF of each voltage-driven joint, expressed as viscous friction [N m s/rad], by parameter name."""
     found: dict[str, float] = {}
     for servo, moved in zip(fake.servos, fake.joints, strict=True):
         if config.joints[moved].drive_mode is Mode.PWM:
@@ -85,7 +85,7 @@ def truth_of(result: Result, config: Config) -> Truth:
 
 
 def scaled(truth: Mapping[str, float] | None, config: Config, extra: Mapping[str, Quantity]) -> dict[str, float] | None:
-    """The entry `truth_scaled` of a result: its `truth` scaled like its parameters; None if scaling changes nothing."""
+    """Return `truth` scaled like a result's parameters, for its entry `truth_scaled`; None if nothing changes."""
     found = in_file_unit(truth or {}, config, extra, len(config.joints))
     return found.values if found.note else None
 
@@ -103,13 +103,13 @@ def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str
         if abs(ratio - 1.0) > _EQUAL
     ]
     note = (
-        f"The torque constants of the fake arm's motors differ from the file's ({', '.join(named)}), and the result "
-        "assumes the file's: the true values shown are scaled to match"
+        f"The torque constants in the file differ from those of the fake arm's motors ({', '.join(named)}). The result "
+        "assumes the file's constants, so the true values shown are scaled to match"
     )
     left = (
         ""
         if len(values) == len(truth)
-        else "; values that depend on several joints with different errors are not shown"
+        else "; values that depend on several joints whose constants have different errors are not shown"
     )
     return Truth(values, f"{note}{left}.")
 

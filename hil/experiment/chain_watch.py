@@ -2,9 +2,9 @@
 
 Prior knowledge is the ensemble's mean and inflated covariance. While the arm is in its rest pose, something may support
 it, so no joint is judged. A joint that stands still at its rest angle may be lying against an end stop, so it is
-judged only by torques towards the side on which it has been. The same applies to a joint that has just come back to
-that angle, since it may have hit the stop. A joint that has not left its rest angle yet may be lying against a stop on
-the side to which gravity pulls it: it is judged only while its torque acts towards that side.
+judged only while torque acts towards the side on which it has been. The same applies to a joint that has just come back
+to that angle, since it may have hit the stop. A joint that has not left its rest angle yet may be lying against a stop
+on the side to which gravity pulls it: it is judged only while its torque acts towards that side.
 """
 
 import math
@@ -38,11 +38,11 @@ friction of up to twice the mean from raising an alarm.
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
 _IMPACT_S, _MOST_REBOUND = 0.05, 0.5
-"""How long a joint that has come back to its rest angle may bounce off a stop [s], and its largest speed then, relative
-to the speed before.
+"""How long a joint that has come back to its rest angle may bounce off a stop [s], and its largest speed while it
+bounces, relative to the speed before the impact.
 """
 WINDOW_S = 0.3
-"""Time span [s] of the torque range that a message about a stationary joint states."""
+"""Time span [s] for which a message about a stationary joint gives the range of torques."""
 
 
 class ChainWatch:
@@ -83,7 +83,7 @@ class ChainWatch:
         self._velocity = np.zeros(n)
         """Latest velocities (joints,) [rad/s]."""
         self._hit_at, self._hit_speed = np.full(n, -np.inf), np.zeros(n)
-        """When each joint may last have hit a stop near its rest angle [s], and its speed before [rad/s]."""
+        """When each joint may last have hit a stop near its rest angle [s], and its speed before the impact [rad/s]."""
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""

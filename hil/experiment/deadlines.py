@@ -59,7 +59,7 @@ class Deadlines:
             return
         missed = max(self._in_a_row, int(seconds / self._interval))
         raise SafetyStop(
-            f"{missed} deadlines in a row were missed, {_told(seconds)} without a command; {said} allows "
+            f"{missed} deadlines in a row were missed: {_told(seconds)} passed without a command; {said} allows "
             f"{1e3 * allowed:.0f} ms. {_WHY_LATE}{self._acted(seconds)}",
             Cause.LATE,
         )
@@ -84,8 +84,8 @@ class Deadlines:
             )
             return f", most of them while this program waited for replies that were lost or damaged. {heard}"
         return (
-            f": the replies arrive too late for {1 / self._interval:g} Hz. `hil check` measures what this bus can do: "
-            "check the adapter's latency timer and the servos' return delay, or lower experiment.rate."
+            f": the replies arrive too late for {1 / self._interval:g} Hz. `hil check` measures what this bus can do. "
+            "Check the adapter's latency timer and the servos' return delay, or lower experiment.rate."
         )
 
     def check_gap(self, seconds: float) -> None:

@@ -131,7 +131,7 @@ class Guard:
         self._silence.woke_up(now, late)
 
     def others_answer(self) -> None:
-        """Record that some unheard servos do answer, but a silent one hides their replies."""
+        """Record that some servos that seem silent do reply, but that a silent servo hides their replies."""
         self._silence.others_answer = True
 
     def late(self, seconds: float = 0.0) -> None:
@@ -337,7 +337,7 @@ class Guard:
         # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
         shared = "No servo was heard; requests or replies are lost: check the adapter, the cables and the supply"
         if self._silence.is_busy:
-            return f"{shared}, and whether other programs keep this computer busy: this program was running late."
+            return f"{shared}, and whether other programs keep this computer busy, since this program was running late."
         return f"{shared}."
 
     def _not_together(self, index: int, servo: int, turned: float) -> NoReturn:

@@ -85,7 +85,7 @@ _USUAL_S = 1.0
 _GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which changes of velocity are not checked."""
 _WINDOW_S = 0.3
-"""Time span [s] of the torque range that a message about a stationary joint states: a single value may be near zero."""
+"""Time span [s] for which a message about a stationary joint gives the range of torques: one value may be near zero."""
 
 
 JOLT = np.dtype(
@@ -94,10 +94,10 @@ JOLT = np.dtype(
 )
 """Statistics of a joint's changes of velocity; initially zero, except `begun`, which is minus infinity.
 
-square: mean square of ordinary changes [rad^2/s^2], over age [s]. squared, since: integral of the squared changes not
-yet included, because they may belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s].
-begun: time of that change [s]. count, oldest: number of earlier velocities stored, and the row of the oldest. reversed:
-whether the joint reversed in the first change of a possible jolt.
+square: mean square of ordinary changes [rad^2/s^2], over age [s]. squared, since: integral of the squared changes that
+are not yet included because they may belong to a jolt, and the time that it covers [s]. change: first change of a
+possible jolt [rad/s]. begun: time of that change [s]. count, oldest: number of earlier velocities stored, and the row
+of the oldest. reversed: whether the joint reversed in the first change of a possible jolt.
 """
 
 
@@ -108,8 +108,8 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
     No motor can do this on any arm: it would have to accelerate and brake much harder than ever before. The check
     therefore needs no knowledge of the arm. Changes of velocity over `JOLT_S` are compared with ordinary ones.
 
-    If the joint reverses in both changes, the teeth of a gear with backlash have changed sides twice in succession: the
-    motor crosses the gap much faster than it drives the arm. This is not a jolt.
+    If the joint reverses in both changes, the motor has crossed the backlash of its gear twice in succession, which it
+    does much faster than it can move the arm. This is not a jolt.
 
     joints: records of type JOLT. former: the latest velocities (samples within `JOLT_S`, joints) [rad/s]. least:
     smallest change that counts as a jolt [rad/s].
@@ -350,7 +350,7 @@ class ModelWatch:
 
 
 def standing_for(states: Iterable[State], joint: int) -> float:
-    """Return for how long a joint has hardly moved [s], judging by its angle.
+    """Return how long a joint has hardly moved [s], judging by its angle.
 
     states: the latest states, the most recent first.
     """
@@ -403,8 +403,8 @@ def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[di
 def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Array]:
     """Mean and covariance if only the planned torque and the servos' dry friction are known.
 
-    Friction decides whether a stationary joint is being held: without a bound on friction, any torque might be too
-    small.
+    To find out whether something holds a stationary joint, its friction must be bounded: otherwise, any torque might
+    be too small to move it.
     """
     guesses = [servo_prior(joint.joint.servo).coulomb for joint in config.joints]
     mean = {f"coulomb_{number}": guess.median for number, guess in enumerate(guesses, 1)}

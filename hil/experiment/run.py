@@ -199,7 +199,7 @@ def _play(
 
 
 def _moved_without_torque(config: Config, bus: ServoBus, recorder: Recorder) -> str:
-    """Say how the arm has moved since the last sample, after which its torque was cut; "" if nothing is known."""
+    """Say how the arm has moved since the last sample before torque was cut; "" if nothing is known."""
     samples = recorder.samples
     if not len(samples) or bus.torque_off_report is None:
         return ""
@@ -223,8 +223,8 @@ def _try_again(bus: ServoBus, note: Note) -> None:
 
 
 def _why_silent(bus: ServoBus, stop: SafetyStop) -> str:
-    """Say that replies were late if they arrived once torque was cut. Otherwise, if no servo was heard, say which ones
-    answered then: a silent servo hides those after it.
+    """Say that replies were late if they arrived after torque was cut. Otherwise, if no servo was heard, say which ones
+    answered after that: a silent servo hides the replies of those after it.
     """
     report = bus.torque_off_report
     if stop.unheard is None or report is None:

@@ -36,7 +36,7 @@ _REMEMBERED = 256
 """Number of latest goals kept."""
 
 _LONGEST_DELAY_S = 0.1
-"""Longest delay that requests are assumed to have [s]; if a servo seems to hold an older goal, it is a coincidence."""
+"""Longest delay assumed for requests [s]; if a servo seems to hold an older goal, this is taken as a coincidence."""
 
 _HELD_BEFORE = 4
 """If writes are lost, a servo may also hold one of the last `_HELD_BEFORE` goals sent before a status last matched."""
@@ -44,8 +44,8 @@ _HELD_BEFORE = 4
 
 OLD_REPLIES = (
     Cause.STALE,
-    "returns stale data: its replies do not change, or are late by its own clock. A device between adapter and servo "
-    "repeats or delays them.",
+    "returns stale data: its replies do not change, or are late according to its own clock. A device between adapter "
+    "and servo repeats or delays them.",
 )
 
 
@@ -176,14 +176,14 @@ class StatusCheck:
                 )
             if late * self._interval <= _LONGEST_DELAY_S:
                 return Cause.GOALS_LOST, (
-                    f"receives goals {cycles} late: by its own clock, its replies are recent. A device between adapter "
-                    "and servo delays requests. Check the adapter, its latency and its cable."
+                    f"receives goals {cycles} late: according to its own clock, its replies are recent. A device "
+                    "between adapter and servo delays requests. Check the adapter, its latency and its cable."
                 )
         unit = self._unit[joint]
         held = f"it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent"
         if self._is_foreign[joint] or is_repeated:
             return Cause.GOALS_LOST, (
-                f"does not hold the goals of this program: {held}, and it holds goals that this program never sent. "
+                f"does not hold the goals of this program: {held}, and it has held goals that this program never sent. "
                 "Either another program or controller is commanding it (stop or unplug that one), or goals are being "
                 "corrupted on the bus (check the adapter and the cable)."
             )
@@ -197,8 +197,8 @@ class StatusCheck:
     def _late(self, joint: int, held: float, former: float, ago: int) -> int:
         """Return by how many cycles a servo's replies must be late, at least 0.
 
-        They are late if the goal `held`, which is reported now, had already been sent `ago` cycles before, when a
-        differing status reported the goal `former` instead [A or V].
+        held: the goal reported now [A or V]. former: the wrong goal reported `ago` cycles earlier [A or V]. Replies are
+        late if `held` had already been sent at that time.
         """
         half = self._half_tick[joint]
         for cycles, goals in enumerate(reversed(self._goals)):
@@ -216,7 +216,7 @@ class StatusCheck:
         return self._heard_instead() or refused
 
     def _never_sent(self, joint: int, held: float) -> bool:
-        """Whether the goal that is held differs from every goal sent to any joint since a status last matched.
+        """Whether the goal that a servo holds differs from every goal sent to any joint since a status last matched.
 
         The halves of a two-servo joint's goal may differ in age, so nothing is known about their sum.
         """
@@ -255,7 +255,7 @@ class StatusCheck:
                     "Check the adapter, and that every servo has its own ID."
                 )
             return Cause.STALE, (
-                f"returns stale data: by its own clock its reply is {1e3 * abs(ahead):.0f} ms off. Replies "
+                f"returns stale data: according to its own clock, its reply is {1e3 * abs(ahead):.0f} ms off. Replies "
                 "are delayed in transit, or the servo was rebooted. Check the adapter, its latency and its cable."
             )
         least = offset if ahead < drifted else behind + drifted

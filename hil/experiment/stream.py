@@ -43,8 +43,8 @@ from hil.setup.session.servo_session import has_moved
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
 _STILL_STEPS, _FALSE_STEPS = 1, 4
-"""Largest change in the reading of a joint at rest, in encoder steps: the joint may rest between two steps. Second
-value: distance that reported velocities must add up to before they count as false.
+"""Largest change in the reading of a joint at rest, in encoder steps: the joint may rest between two steps. The
+second value is the distance that reported velocities must add up to before they count as false.
 """
 
 _BY_OTHER_GOALS = {
@@ -277,7 +277,7 @@ class Stream:
                     self._check_motion(repetition.moved)
                 return
         if difference <= self._plan.drift_within:
-            self._note(f"{segment.role}: still drifting slowly: {difference:.2%} per period; using the last periods")
+            self._note(f"{segment.role}: still drifting slowly ({difference:.2%} per period); using the last periods")
             return
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._pace.interval:g} s the motion is "
@@ -287,7 +287,10 @@ class Stream:
         )
 
     def _advice(self, differences: Sequence[float], samples: int) -> str:
-        """Return advice on periods of `samples` samples whose successive differences are `differences`."""
+        """Return advice for motion that has not settled.
+
+        differences: each period's difference from the one before. samples: number of samples per period.
+        """
         decay = decay_of(differences, self._plan.settle_within)
         if decay is None:
             return "Check for backlash, a dragging cable or a slipping joint, or raise max_settling_periods."
@@ -308,7 +311,7 @@ class Stream:
             )
         return (
             f"The change decreases from period to period ({listed}), by a factor of {decay.ratio:.2g} each time: the "
-            "transient at the start has not died out yet. It needs more periods: set "
+            "transient at the start has not died out yet. More periods are needed: set "
             f"experiment.max_settling_periods = {played}."
         )
 
@@ -329,7 +332,7 @@ class Stream:
 
     def _more_torque(self) -> str:
         if self._config.is_chain:
-            return "raise experiment.rate, at which a stiffer stabiliser moves it, or widen position_limit"
+            return "raise experiment.rate, so that a stiffer stabiliser can move it, or widen position_limit"
         if self._config.experiment.pilot:  # the pilot chooses the torque
             return "widen position_limit or raise the lower end of experiment.band, so that more torque is safe"
         return "raise experiment.peak_torque"

@@ -42,11 +42,11 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
         apart = joint.movable if share > 0.0 else ()
         merged = [name for name in joint.fixed if name not in apart]
         if merged:
-            comment(link, f"including {', '.join(merged)}, which is fixed to it and has no inertia of its own")
+            comment(link, f"includes the inertia of these links, which are fixed to this one: {', '.join(merged)}")
             for name in merged:
                 _remove(links[name], "inertial")
         if apart:
-            comment(link, f"without {', '.join(apart)}, moved by held joints: given by the description, not identified")
+            comment(link, f"excludes links moved by held joints, whose inertia was not identified: {', '.join(apart)}")
         if share < 1.0:
             reduced.append(
                 f"the full inertia that the description gives {', '.join(joint.movable)}; the file has "
@@ -165,7 +165,7 @@ def _add_geoms(body: ET.Element, solids: Sequence[Solid]) -> None:
 def _describe(root: ET.Element, model: ChainArmModel, found: ChainLinks, left: list[str]) -> None:
     words = [
         f"Inertias, damping and friction identified by hil {__version__}; everything else is from {found.path.name}.",
-        "Link inertias: the dynamically equivalent ones closest to that file's. Only the following "
+        "The link inertias are the dynamically equivalent ones closest to that file's. Only the following "
         "combinations were identified:",
         *(f"{model.groups[name]} = {model.values[name]!r} +- {model.stds[name]:.1e}" for name in model.groups),
         *(f"Not representable in this format: {sentence}" for sentence in left),
@@ -184,7 +184,7 @@ def _replace_inertial(link: ET.Element, body: Body) -> None:
 
 
 def _scale_inertial(link: ET.Element, share: float) -> None:
-    comment(link, f"{share:g} of the described mass and inertia: the full values would leave nothing for its parent")
+    comment(link, f"{share:g} of the described mass and inertia: the full values would leave none for its parent link")
     for element in (*link.findall("inertial/mass"), *link.findall("inertial/inertia")):
         for key, value in element.attrib.items():
             element.set(key, numbers(share * float(value)))

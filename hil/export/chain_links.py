@@ -63,7 +63,7 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
     said = []
     if found.misfit > FAR:
         said.append(
-            "the identified values exactly: no physically consistent links have them; the nearest are "
+            "the identified values exactly: no physically consistent links have them, and the nearest ones are "
             f"{found.misfit:.1f} standard errors away"
         )
     bodies = tuple(_body(row) for row in found.links)
@@ -89,7 +89,7 @@ def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
 
 
 def _same_groups(base: BaseParameters, groups: Mapping[str, str]) -> bool:
-    """Return whether these groups are those of the base parameters, up to rounding of their factors."""
+    """Return whether these groups equal those of the base parameters, apart from rounding of their factors."""
     if set(groups) != set(base.names):
         return False
     return all(_same_sum(group, groups[name]) for name, group in zip(base.names, base.groups, strict=True))

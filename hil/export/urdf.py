@@ -24,7 +24,7 @@ def export_urdf(source: Source, path: Path) -> list[str]:
     links = distribute(model, source.link_length)
     left = [*left_out(model), *torque_constants(model)]
     if model.gravity not in (0.0, STANDARD_GRAVITY):
-        left.append(f"gravity = {model.gravity:g} m/s^2, which the masses are based on: set it in the physics engine")
+        left.append(f"gravity = {model.gravity:g} m/s^2, on which the masses are based: set it in the physics engine")
     root = ET.Element("robot", name="arm")
     describe(root, model, left)
     ET.SubElement(root, "link", name="base")

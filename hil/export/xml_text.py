@@ -26,7 +26,7 @@ def describe(root: ET.Element, model: ArmModel, left: list[str]) -> None:
     for name, value in model.values.items():
         comment(root, f"{name} = {value!r} +- {model.stds[name]:.1e}")
     if not all(joint.has_limits for joint in model.joints):
-        comment(root, "Without limits of joints and drives: the recording does not contain them.")
+        comment(root, "This file has no joint or drive limits, because the recording does not contain them.")
     for sentence in left:
         comment(root, f"Not representable in this format: {sentence}")
 

@@ -143,9 +143,7 @@ class Belief:
         return belief._without_strays(left, random)
 
     def _motions(self, config: Config, seen: Seen, arms: NDArray[np.int64] | None = None) -> Array:
-        """Motion (arms, joints, samples) [rad] of the arms with these indices, by default all, under the recorded
-        commands.
-        """
+        """Motion (arms, joints, samples) [rad] of arms (given by index; default: all) under the recorded commands."""
         coordinates = self.coordinates if arms is None else self.coordinates[arms]
         ensemble = replace(self, learned=0, coordinates=coordinates).ensemble()
         poses = np.tile(seen.pose, (ensemble.size, 1))

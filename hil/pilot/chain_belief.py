@@ -33,7 +33,7 @@ _LEAST_NOISE_SHARE = 0.005  # smallest noise, relative to a joint's largest torq
 _MODEL_SPREAD = 0.01  # of each parameter of links and drives, for effects that the model does not include
 _FEWEST_ROWS = 50
 _PEAK, _BREAKAWAY = 0.99, 1.15
-"""Dry friction of a joint that did not move is assumed to exceed this quantile of its torque by this factor."""
+"""Dry friction of a joint that did not move: at least the quantile `_PEAK` of its torque, times `_BREAKAWAY`."""
 _LEAST_FRICTION_SHARE = 1e-4
 _POSES = 12
 _HALVINGS = 6
@@ -226,7 +226,7 @@ def _rows(arms: ChainArms, config: Config, samples: NDArray[np.void]) -> tuple[A
 
 
 def _withstood(config: Config, samples: NDArray[np.void], Y: Array, torque: Array, fitted: Array) -> Array:
-    """Torque that did not move each joint that stood still in the last period (joints,) [N m]; 0 for the others.
+    """Torque that failed to move each stationary joint in the last period (joints,) [N m]; 0 for joints that moved.
 
     Y, torque: as returned by `_rows`. fitted: parameters of the arm.
     """

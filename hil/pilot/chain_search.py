@@ -152,9 +152,7 @@ class ChainSearch(SafeShares):
         return error
 
     def learn(self, config: Config, folder: RunFolder) -> None:
-        """Update the belief, and the record of which joints were beyond their rest pose, from the recording in a
-        folder.
-        """
+        """Update the belief from a recording, and note on which sides of its rest angle each joint has been."""
         samples = load_samples(folder.samples_path, len(config.joints))
         self.belief = self.belief.learn(config, samples)
         found = passed_rest(config, samples["position"])

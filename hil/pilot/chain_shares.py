@@ -163,8 +163,8 @@ class SafeShares:
                 continue
             if replace(self, given=faster, paths=paths)._largest(faster, shares)[0] is not None:
                 return (
-                    f" Simulated at experiment.rate = {rate:g}, a motion is safe. At {experiment.rate:g} Hz, delay "
-                    "makes a stiff stabiliser oscillate, and a softer one is too weak for these arms."
+                    f" In a simulation at experiment.rate = {rate:g}, a motion is safe. At {experiment.rate:g} Hz, "
+                    "delay makes a stiff stabiliser oscillate, and a softer one is too weak for these arms."
                 )
         return ""
 
@@ -324,18 +324,18 @@ def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
         )
     torque = QUANTITIES.index("torque")
     if peaks.quantile[torque, at] > SATURATED * peaks.limits[torque, at]:
-        helps.append(f"a larger {joint.goal_limit_name} for {joint.name!r}, since some simulated arms need all of it")
+        helps.append(f"a larger {joint.goal_limit_name} for {joint.name!r}, since some simulated arms reach it")
     if has_room:
         spread = _spread(config)
         helps.append(
             f"more accurate masses in the URDF ([arm.prior] spread = {share * spread:.2g} instead of {spread:g})"
         )
-    return f"What helps, alone or together: {'; '.join(helps)}"
+    return f"These changes help, alone or together: {'; '.join(helps)}"
 
 
 def _too_soft(peaks: Prediction) -> float:
-    """Factor by which the stabiliser must be stiffened to keep all joints within their limits; infinite if none
-    suffices.
+    """Factor by which the stabiliser must be stiffened to keep all joints within their limits; infinite if no
+    factor suffices.
     """
     middle, reached = (peaks.median[:GUARDED], peaks.quantile[:GUARDED])
     room, way = (np.abs(each - middle) for each in (peaks.limits[:GUARDED], reached))

@@ -91,7 +91,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
 
 
 def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -> Array:
-    """Largest torque (joints,) [N m] of the next run, after `error` ended one that exceeded no limit.
+    """Largest torque (joints,) [N m] of the next run, after `error` ended a run within all limits.
 
     With little friction, a large motion may never settle; less torque helps. If torque hardly exceeds dry friction,
     however, friction stops the joint in a different place each time, and less torque would not move it at all.
@@ -119,8 +119,8 @@ def _faster(config: Config, options: PilotOptions) -> list[float]:
 
 
 def _tolerant(config: Config, most: float) -> Config:
-    """The configuration with other multisines, and with twice the permitted difference between successive periods, at
-    most `most`.
+    """The configuration with other multisines and a permitted difference between successive periods that is twice as
+    large, but at most `most`.
     """
     experiment = config.experiment
     within = min(2.0 * experiment.settle_within, max(experiment.settle_within, most))

@@ -43,14 +43,14 @@ class PilotOptions:
     torque_after_limit: float = 0.85
     """Cap on the torque of later runs, relative to the torque at which a limit was exceeded."""
     torque_after_unsettled: float = 0.85
-    """Cap on the torque of runs after one that never settled, relative to that run's torque."""
+    """Cap on the torque after a run that never settled, relative to the torque of that run."""
     torque_over_friction: float = 1.8
     """After a run that never settled, a joint's torque is not lowered if it is at most this multiple of its Coulomb
     friction.
     """
     worthwhile_raise: float = 1.15
-    """Minimum ratio of the new torque to the last run's that justifies another run if little of the range is unused
-    (see `fair_share`).
+    """Minimum ratio of the new torque to that of the last run for which another run is worthwhile, if little of the
+    range is unused (see `fair_share`).
     """
     worthwhile_raise_far: float = 1.03
     """Replaces `worthwhile_raise` if much of the range is unused."""
@@ -64,7 +64,7 @@ class PilotOptions:
     """Maximum number of other waves to try; they differ in the sign of each joint and in the direction of time."""
 
     falling_raise: float = 1.35
-    """Maximum ratio of the torques of successive runs of an arm that falls over when it is stopped."""
+    """Maximum ratio of the torques in successive runs, for an arm that falls over when it is stopped."""
     falling_breakaway_raise: float = 1.2
     """`breakaway_raise` for an arm that falls over when it is stopped."""
     falling_share: float = 0.85

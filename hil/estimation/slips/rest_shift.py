@@ -18,14 +18,14 @@ LEAST_RAD = 0.1
 """Smallest shift that is reported [rad]."""
 
 _FRICTION_TIMES = 2.0
-"""Multiple of the servo's typical breakaway friction that can hold a joint away from its hanging position."""
+"""Friction that can hold a joint off its hanging position, relative to its servo's typical breakaway friction."""
 
 _STILL_RAD = 0.02
 """Range of positions within which an arm counts as resting [rad]."""
 
 
 def rest_shift_warnings(config: Config, samples: NDArray[np.void], result: SettledResult) -> list[str]:
-    """One sentence per joint whose rest angle changed by more than friction usually explains.
+    """Return one sentence for each joint whose rest angle changed by more than friction can usually explain.
 
     Nothing is reported if the verdict is "yes", or if the arm is horizontal or held by a stabiliser.
     """

@@ -37,9 +37,9 @@ def disagreement(
     worst = max(float(each.residual_over_noise.max()) for each in alone)
     differs = _differences(alone, called)
     return (
-        f"The recordings disagree: separate fits leave residuals of at most {worst:.1f} times the noise, a common fit "
-        f"{left:.1f} times{': ' if differs else ''}{'; '.join(differs)}. Was the load, the mounting or a "
-        "setting changed between the recordings? Estimate each separately.",
+        f"The recordings disagree: separate fits leave residuals of at most {worst:.1f} times the noise, but a common "
+        f"fit leaves {left:.1f} times the noise{': ' if differs else ''}{'; '.join(differs)}. Was the load, the "
+        "mounting or a setting changed between the recordings? Estimate each separately.",
     )
 
 

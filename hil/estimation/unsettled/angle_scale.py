@@ -1,10 +1,10 @@
 """Detection of angles with a wrong scale: an encoder resolution, belt ratio or gear ratio other than the stated one.
 
 A joint's equation is linear in its angle except for gravity, so only gravity reveals the scale. Near the angle at which
-the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, i.e. weaker gravity plus a spring: with a
-spring, an offset and an encoder zero, a fit explains angles with a wrong scale s down to the noise, but with wrong
-values. So if a fit finds a spring, the motion is fitted again without a spring but with the scale that would imitate
-one.
+the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, i.e. weaker gravity plus a spring. A model
+with a spring, an offset and an encoder zero therefore fits angles with a wrong scale s down to the noise, but its
+values are wrong. So if a fit finds a spring, the motion is fitted again without the spring but with the scale that
+would have the same effect.
 """
 
 import math
@@ -53,9 +53,9 @@ def angle_scale(
 
 
 def _candidate(recordings: Sequence[Recording], estimate: ShootingEstimate, about: Array) -> _Scale | None:
-    """The scale of the first joint that would imitate the spring of the estimate.
+    """The angle scale of the first joint that would have the same effect as the spring in the estimate.
 
-    No spring can imitate a wrong scale of another joint, which changes that joint's effect on the first one.
+    A wrong scale of another joint also changes that joint's effect on the first one, which no spring can imitate.
     """
     value, names = estimate.parameters, list(estimate.names)
     if SPRING not in names or not value["gravity_1"] > 0.0:
@@ -130,8 +130,8 @@ def _said(scale: _Scale, found: ShootingEstimate, estimate: ShootingEstimate) ->
     cause = (
         ""
         if scale.by_zero
-        else " Only a spring that is slack where joint 1 hangs has the same effect: if there is one, this model is "
-        "right."
+        else " Only a spring that is slack where joint 1 hangs would have the same effect: if the arm has such a "
+        "spring, this model is right."
     )
     given, other = estimate.parameters["gravity_1"], found.parameters["gravity_1"]
     return (

@@ -77,15 +77,15 @@ def _stopped_or_clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
         f"Joint {stop.joint} seems to press against something that yields (a stop, a cable or an object) {than} about "
         f"{stop.at:.3g} rad: with a stiffness of {stop.stiffness:.2g} N m/rad there, inverse dynamics leaves "
         f"{100 * stop.residual:.2g} % of the torque unexplained instead of {100 * stop.residual_given:.2g} %. Record "
-        "a motion that does not reach it.",
+        "a motion that does not reach that angle.",
     )
 
 
 def _clipped(recordings: Sequence[Recording], found: Sequence[Clipped]) -> tuple[str, ...]:
     return tuple(
         f"{_unsigned(recordings, each.joint)}The torque of joint {each.joint} seems to have been limited to about "
-        f"{each.level:.3g} N m; its column exceeds that in {100 * each.beyond:.2g} % of the samples. With this limit, "
-        f"inverse dynamics leaves {100 * each.residual:.2g} % of the torque unexplained instead of "
+        f"{each.level:.3g} N m; its column exceeds this value in {100 * each.beyond:.2g} % of the samples. With "
+        f"this limit, inverse dynamics leaves {100 * each.residual:.2g} % of the torque unexplained instead of "
         f"{100 * each.residual_given:.2g} %. A "
         "current limit or the supply voltage clips it (saturation): use the measured current, or smaller commands."
         for each in found
@@ -98,8 +98,8 @@ def _unsigned(recordings: Sequence[Recording], joint: int) -> str:
     if torque.min() < 0.0 < torque.max():
         return ""
     return (
-        f"The torque of joint {joint} never changes its sign: its column may hold magnitudes. If so, log it with its "
-        "sign. Otherwise: "
+        f"The torque of joint {joint} never changes sign: its column may contain only magnitudes. If so, log the "
+        "torque with its sign. Otherwise: "
     )
 
 
@@ -111,7 +111,8 @@ def _late(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return (
         f"The torque of joint {late.joint} seems to be logged about {1e3 * abs(late.delay):.2g} ms too {than}, "
         f"compared with the other joint: allowing for this, inverse dynamics leaves {100 * late.residual:.2g} % of the "
-        f"torque unexplained instead of {100 * late.residual_given:.2g} %. Shift its column, or log both together.",
+        f"torque unexplained instead of {100 * late.residual_given:.2g} %. Shift its column, or log both "
+        "torques at the same time.",
     )
 
 
@@ -121,10 +122,10 @@ def _uneven(recordings: Sequence[Recording]) -> tuple[str, ...]:
         return ()
     return (
         f"The position of joint {found.late} may be logged about {1e3 * found.by:.2g} ms later, relative to its "
-        f"torque, than that of joint {found.early}: inverse dynamics of one of these joints leaves "
-        f"{100 * found.residual:.2g} % of its torque unexplained with its own delay, "
-        f"{100 * found.residual_given:.2g} % with the other's. Log all columns at the same time, or shift those of "
-        "one joint.",
+        f"torque, than that of joint {found.early}: for one of these joints, inverse dynamics leaves "
+        f"{100 * found.residual:.2g} % of the torque unexplained with the joint's own delay, but "
+        f"{100 * found.residual_given:.2g} % with that of the other joint. Log all columns at the same time, or shift "
+        "those of one joint.",
     )
 
 

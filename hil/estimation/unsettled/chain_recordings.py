@@ -51,7 +51,7 @@ class ChainEstimated:
 def estimate_chain_recordings(
     recordings: Sequence[Recording], config: RecordingConfig, shown_path: str, source: str
 ) -> ChainEstimated:
-    """Estimate a spatial arm from recordings. source: names their files in messages.
+    """Estimate a spatial arm from recordings. source: names of their files, for messages.
 
     Raises ConfigError, CsvError, ArmFileError, EstimationError.
     """
@@ -141,9 +141,10 @@ def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescripti
 
 
 def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior, contradictory: bool) -> RecordedChain:
-    """The fit. contradictory: whether the torques seem to contradict each other.
+    """Fit the model to the recordings. contradictory: whether the torques seem to contradict each other.
 
-    If so, and if torques are held between samples, their ratios are fitted too, but dropped if the torques then agree.
+    If they do, and if they are held between samples, the ratios of the torques are fitted too. If this shows that the
+    torques agree after all, the model is fitted again without the ratios.
     """
     if contradictory and all(each.between == "held" for each in recordings):
         found = identify_recordings(recordings, replace(model, torque_scale=True), prior)
@@ -153,7 +154,7 @@ def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior
 
 
 def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> Array | None:
-    """Return the relative torque error on the last part, with parameters fitted to the rest.
+    """Return the relative torque error on the last part of each recording, with parameters fitted to the rest.
 
     None if a part is too short or the arm stands still in it.
     """
@@ -213,7 +214,7 @@ def _verdict(
     if found.simulated:
         worst = float(found.residual_over_noise.max())
         joint = arm.joints[int(np.argmax(found.residual_over_noise))].name
-        sentences.append(f"The largest residual ({joint}) is {worst:.2f} times the noise of its angle.")
+        sentences.append(f"The largest residual ({joint}) is {worst:.2f} times the noise of that joint's angle.")
         trust = trust if worst <= EXPLAINED else "with care"
         if found.systematic > SYSTEMATIC:
             trust = "with care"
@@ -227,9 +228,9 @@ def _verdict(
     else:
         trust = "with care"
         sentences.append(
-            "The torque was taken as measured, so the result comes from a regression; its errors are partly "
-            'systematic. If the columns hold commands, set columns.between = "held": maximum likelihood is then far '
-            "more accurate."
+            "The torque columns were treated as measurements, so the result comes from a regression; its errors are "
+            'partly systematic. If the columns hold commands, set columns.between = "held": maximum likelihood is then '
+            "far more accurate."
         )
     at_most, why = _judged_prediction(foretold, arm, explained)
     trust = lowered(trust, at_most)
@@ -269,8 +270,8 @@ def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: b
     """The best verdict that the prediction of the last part allows ("" for any), and why."""
     if foretold is None:
         return "with care", (
-            "The recordings are too short, or go on too long after the motion, to check the prediction on a part that "
-            "was not fitted.",
+            "The recordings are too short, or continue for too long after the motion has ended, to check the "
+            "prediction on a part that was not fitted.",
         )
     error, wrong = float(np.nanmax(foretold)), TORQUE_WRONG if explained else TORQUE_UNEXPLAINED
     said = _foretold_said(error, arm.joints[int(np.nanargmax(foretold))].name)
@@ -280,7 +281,7 @@ def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: b
     return "no", (
         said,
         f'An error above {100 * wrong:.0f} %{unexplained} makes the verdict "no": check which column belongs to which '
-        "joint, their units and signs, whether the load changed, and the description of the arm.",
+        "joint, the units and signs of the columns, whether the load changed, and the description of the arm.",
     )
 
 
@@ -289,12 +290,12 @@ def _foretold_said(error: float, joint: str) -> str:
     part = f"the torque in the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
     if error > 1.0:
         return (
-            f"Fitted to the rest, the model is useless for predicting {part}: the error is {error:.2g} times the "
+            f"When fitted to the rest, the model cannot predict {part}: the error is {error:.2g} times the "
             f"torque's own RMS (worst joint: {joint})."
         )
     return (
-        f"Fitted to the rest, the model predicts {part} to within {100 * error:.1f} % of its RMS (worst joint: "
-        f"{joint})."
+        f"When fitted to the rest, the model predicts {part} to within {100 * error:.1f} % of the torque's RMS (worst "
+        f"joint: {joint})."
     )
 
 

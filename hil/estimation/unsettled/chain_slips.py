@@ -26,14 +26,14 @@ def refuse_chain_slips(check: ColumnCheck | None, joints: Sequence[str], source:
         gain = "friction is positive instead of negative" if signs.impossible else unexplained(*signs.residuals)
         instead = f" (or, just as likely, {signs.instead.said(joints)})" if signs.instead else ""
         raise CsvError(
-            f"{source}: {reversal_said(signs.signs, joints)}, {gain}{instead}. Change that in the file, or correct the "
+            f"{source}: {reversal_said(signs.signs, joints)}, {gain}{instead}. Fix this in the file, or correct the "
             "axis in the description of the arm; `hil pose` shows each joint's direction."
         )
     times = check.wrong_times()
     if times is not None:
         raise CsvError(
             f"{source}: the times seem to be about {times.factor:.2g} times the true ones: with times divided by this "
-            f"factor, {unexplained(*times.residuals)}. Check the unit of time and the sample rate, and arm.gravity."
+            f"factor, {unexplained(*times.residuals)}. Check the unit of time, the sample rate and arm.gravity."
         )
 
 
@@ -51,7 +51,7 @@ def late_torque(check: ColumnCheck | None, joints: Sequence[str], fitted: bool) 
 
 
 def torques_apart(check: ColumnCheck | None, joints: Sequence[str]) -> tuple[str, ...]:
-    """Sentences about torque columns whose factors differ by more than the spread of torque constants allows."""
+    """Sentences about torque columns whose scales differ by more than the spread of torque constants can explain."""
     factors = None if check is None else check.contradictory_torques()
     known = {f"{RATIO}_{number}": Quantity(each, ROUGHLY * each, "1") for number, each in enumerate(factors or (), 1)}
     return contradictions(joints, known, {}, "column")

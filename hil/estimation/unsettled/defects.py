@@ -30,7 +30,7 @@ def likely_defect(
 
 
 def is_certain(defect: Defect) -> bool:
-    """Whether the defect explains so much of the residual that no other cause need be sought."""
+    """Whether the defect explains so much of the residual that no other cause needs to be considered."""
     return defect.fit.left < WELL
 
 
@@ -94,7 +94,7 @@ def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> t
     percent = " and ".join(f"{100.0 * change:+.2g} %" for change in each)
     match hypothesis.course.kind:
         case "decay":
-            said = f"The friction of {whose} seems to differ by {percent} at the beginning and to settle {when}"
+            said = f"The friction of {whose} seems to begin {percent} off its final value and to settle {when}"
             return said, "Let the arm move for some minutes before you record, so that it is warm."
         case "linear":
             said = f"The friction of {whose} seems to change {when}, by {percent} of its initial value"
@@ -112,25 +112,23 @@ def _torque(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tup
     change, whose = 100.0 * (factor - 1.0), _joints(hypothesis)
     match hypothesis.course.kind:
         case "linear":
-            said = f"The motor torque of {whose}, relative to its column, seems to change {when}, by {change:+.2g} %"
+            said = f"The motor torque of {whose} seems to change {when}, by {change:+.2g} % of the recorded torque"
             return said, "A motor that heats up loses torque: record for a shorter time, or with less torque."
         case "recording":
-            said = f"The motor torque of {whose} seems to be {factor:.4g} times that of its column {when}"
+            said = f"The motor torque of {whose} seems to be {factor:.4g} times the recorded torque {when}"
             said += ", compared with the other recordings"
-            return said, "Check the unit, the gear ratio and the torque constant behind that column."
+            return said, "Check the unit, the gear ratio and the torque constant behind the torque column."
         case _:
-            said = (
-                f"The motor torque of {whose}, relative to its column, seems to have changed by {change:+.2g} % {when}"
-            )
-            return said, "Check the supply voltage, the limits and the scale of that column."
+            said = f"The motor torque of {whose} seems to have changed by {change:+.2g} % of the recorded torque {when}"
+            return said, "Check the supply voltage, the limits and the scale of the torque column."
 
 
 def _offset(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
     del unknowns
     verb = "differ" if hypothesis.course.kind == "recording" else "change"
     return (
-        f"A constant torque on {_joints(hypothesis)} seems to {verb} {when}",
-        "A cable that pulls, a contact or a zero error of the current sensor has this effect.",
+        f"The offset torque on {_joints(hypothesis)} seems to {verb} {when}",
+        "A pulling cable, a contact or a zero error of the current sensor can have this effect.",
     )
 
 
@@ -139,7 +137,7 @@ def _arm(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[
     if hypothesis.course.kind == "recording":
         return f"The arm {when} seems to be a different one, or to carry a different load", "Estimate each separately."
     return (
-        f"The arm seems to have changed {when}: load, mounting, servo or settings",
+        f"The arm's load, mounting, servo or settings seem to have changed {when}",
         "Use only the part before or after the change, or put each part in a separate file.",
     )
 

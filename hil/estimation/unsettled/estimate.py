@@ -63,8 +63,8 @@ class Given:
     """Prior knowledge of the drives and encoders.
 
     torque_scale_std: relative standard deviation of the ratio of the torque constants, by parameter. zeros: whether a
-    configuration defines the encoder zeros. names: names of the recordings. jumps: a sentence for each joint of a
-    recording whose position jumped. torque_source: where the torques come from. origin: the angles [rad] at which the
+    configuration defines the encoder zeros. names: names of the recordings. jumps: a sentence for each position
+    jump of a joint in a recording. torque_source: where the torques come from. origin: the angles [rad] at which the
     position columns are 0, by default 0. repeats: whether each recording is the mean of similar periods. length:
     measured length of link 1 [m].
     """
@@ -199,7 +199,7 @@ def joint_names(count: int) -> tuple[str, ...]:
 
 
 def _start(recordings: Sequence[Recording]) -> Array:
-    """Base parameters from inverse dynamics, filtered as lightly as the recordings' rate and length allow."""
+    """Base parameters from inverse dynamics, with as little filtering as the recordings' rate and length allow."""
     for cutoff in START_CUTOFFS[:-1]:
         try:
             return fit_inverse_dynamics(recordings, cutoff, START_WIDTH).value

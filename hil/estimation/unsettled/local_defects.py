@@ -51,7 +51,7 @@ class _Joint:
 def local_defects(
     recordings: Sequence[Recording], names: Sequence[str], predicted: Sequence[Array], window: float
 ) -> tuple[str, ...]:
-    """One sentence for each local defect, for a fit that leaves much of the motion unexplained.
+    """One sentence for each local defect; for use if a fit leaves much of the motion unexplained.
 
     predicted: simulated positions of each recording (joints, samples) [rad]. window: length of the parts whose
     residuals are compared [s].
@@ -126,7 +126,7 @@ def _silent(joint: _Joint, joints: Sequence[_Joint]) -> list[str]:
     together = [each for each in joints if each.time is joint.time]
     return [
         f"The torque of {joint.name} stays at {joint.torque[part.start]:.4g} N m {_from_to(joint.time, part)}, but the "
-        "motion contradicts this: the column lacks the torque that acted there. Leave that part out."
+        "motion contradicts this: the column lacks the torque that acted at that time. Leave that part out."
         for part in _constant(joint.time, joint.torque)
         if any(each.is_unexplained(part) for each in together)
     ]
@@ -207,7 +207,7 @@ def _stop(joint: _Joint) -> list[str]:
             continue
         found.append(
             f"{joint.name[0].upper()}{joint.name[1:]} rebounds at {place:.4g} rad {at.size} times, {_at(time[at])}, "
-            "and never moves past it: it hits a stop or an object there, and no model includes impacts. Use the part "
+            "and never moves past it: it hits a stop or an object there, and no model covers impacts. Use the part "
             "before the first impact, or record motion that stays clear of it."
         )
     return found

@@ -52,10 +52,10 @@ def _torques(recordings: Sequence[Recording]) -> list[str]:
         most = max(float(np.abs(each.torque[joint]).max()) for each in recordings)
         if most > TORQUE[1]:
             found.append(
-                f"Joint {joint + 1}: its torque reaches {most:.3g} N m, which few servos can deliver: check its unit."
+                f"The torque of joint {joint + 1} reaches {most:.3g} N m, which few servos can deliver: check its unit."
             )
         elif 0.0 < most < TORQUE[0]:
-            found.append(f"Joint {joint + 1}: its torque is at most {most:.2g} N m: check its unit.")
+            found.append(f"The torque of joint {joint + 1} never exceeds {most:.2g} N m: check its unit.")
     return found
 
 
@@ -73,7 +73,7 @@ def _pendulum(estimate: ShootingEstimate, gravity: float) -> list[str]:
     if PENDULUM[0] < length < PENDULUM[1]:
         return []
     return [
-        f"Inertia and weight of joint 1 are those of a pendulum {length:.2g} m long: check the units of time and "
+        f"The inertia and weight of joint 1 are those of a pendulum {length:.2g} m long: check the units of time and "
         "angle, and arm.gravity."
     ]
 
@@ -91,10 +91,9 @@ def _link(estimate: ShootingEstimate, gravity: float) -> list[str]:
         if least < abs(value["gravity_2"]) + SURE * std["gravity_2"]:
             return []
         return [
-            f"gravity_2 is {value['gravity_2']:.2g} +- {std['gravity_2']:.2g} N m, but according to coupling, link 2 "
-            f"weighs at least {least:.2g} N m: the torque does not contain gravity. If the drive itself compensates "
-            "for gravity, add that torque to the column. If the arm moves in a horizontal plane, set "
-            "arm.gravity = 0."
+            f"gravity_2 is {value['gravity_2']:.2g} +- {std['gravity_2']:.2g} N m, but coupling implies at least "
+            f"{least:.2g} N m: the torque column does not include gravity. If the drive itself compensates for "
+            "gravity, add that torque to the column. If the arm moves in a horizontal plane, set arm.gravity = 0."
         ]
     length = abs(value["coupling"] * gravity / value["gravity_2"])
     if LINK[0] < length < LINK[1]:

@@ -194,7 +194,7 @@ def _back_emf(columns: Columns, result: ShootingResult) -> list[str]:
     if columns.torque_constant is None:
         return ["The joints are driven by voltage, so viscous friction includes braking by back-EMF."]
     parts = [
-        f"joint {joint + 1} {gain * constant:.3g} of {result.parameters[f'viscous_{joint + 1}'].value:.3g} N m s/rad"
+        f"{gain * constant:.3g} of {result.parameters[f'viscous_{joint + 1}'].value:.3g} N m s/rad in joint {joint + 1}"
         for joint, (gain, constant) in enumerate(zip(gains, columns.torque_constant, strict=True))
     ]
     return [f"The joints are driven by voltage, so viscous friction includes braking by back-EMF: {', '.join(parts)}."]

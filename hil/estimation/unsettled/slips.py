@@ -56,7 +56,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
     if _is_clear(signs.residual, signs.residual_given):
         raise CsvError(
             f"{source}: {reversal_said(signs.signs)}, {unexplained(signs.residual, signs.residual_given)}. "
-            "Change that in the file, or swap the columns."
+            "Correct this in the file, or swap the columns."
         )
     # All torques reversed leave the same residual, but nothing has a negative inertia.
     inertias = [name for name in signs.impossible if name.startswith("inertia")]
@@ -64,7 +64,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
         verb = "are" if signs.signs.are_several else "is"
         raise CsvError(
             f"{source}: {signs.signs.said()} {verb} reversed: as given, {' and '.join(inertias)} would be negative. "
-            "Change that in the file, or reverse the positions."
+            "Correct this in the file, or reverse the positions."
         )
 
 
@@ -82,7 +82,7 @@ def refuse_stuck(recordings: Sequence[Recording], source: str, segment: float) -
         if float(np.quantile(steps, NEARLY_ALL)) < STUCK_STEPS:
             raise CsvError(
                 f"{source}: joint {joint + 1} sticks: in {100 * NEARLY_ALL:.0f} % of the segments of {segment:g} s it "
-                f"moves by less than {STUCK_STEPS:g} encoder steps, so that friction hides everything else. Drive it "
+                f"moves by less than {STUCK_STEPS:g} encoder steps, so friction hides everything else. Drive it "
                 "harder, or record with a finer encoder; longer segments (columns.segment) help if it creeps."
             )
 
@@ -107,7 +107,7 @@ def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequenc
 
 
 def reversal_said(signs: Signs, joints: Sequence[str] = ()) -> str:
-    """Say which signs are reversed; the caller appends the gain of a correction. joints: names, by default numbers."""
+    """Say which signs are reversed; the caller appends the effect of a correction. joints: names; default: numbers."""
     if signs.are_several:
         return f"{signs.said(joints)} are reversed: with these signs changed"
     return f"{signs.said(joints)} is reversed: with the sign changed"
@@ -118,7 +118,7 @@ def _is_clear(residual: float, given: float) -> bool:
 
 
 def unexplained(residual: float, given: float) -> str:
-    """Describe the gain of a correction: the torque that inverse dynamics leaves unexplained with and without it."""
+    """Say how much of the torque inverse dynamics leaves unexplained with a correction, and how much without it."""
     return f"inverse dynamics leaves {_percent(residual)} of the torque unexplained instead of {_percent(given)}"
 
 

@@ -30,7 +30,7 @@ class Doubts:
     doubts: tuple[str, ...]
     warnings: tuple[str, ...]
     reason: str = ""
-    """What the faults have in common, as the end of a sentence."""
+    """The faults in short, worded as the end of a sentence."""
 
 
 def doubts_of(
@@ -137,8 +137,8 @@ def _early(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[
         return []
     return [
         f"The delay is negative, {1e3 * delay:.3g} ms ({intervals:.2g} samples): the torque acted before the time at "
-        "which it is logged, or the positions are logged too early. The fit allows for it; correct the times, or shift "
-        "the torque column, before you use the delay."
+        "which it is logged, or the positions are logged too early. The fit allows for this. Correct the times, or "
+        "shift the torque column, before you use the delay."
     ]
 
 

@@ -12,10 +12,10 @@ accumulate in this difference. The contributions of a healthy servo are known:
 - a velocity that lags by tau, because the servo filters it: tau times (velocity minus its mean over the memory). Any
   lag up to `LAG_S` is accepted;
 - a velocity with a scale error: the same fraction of the distance covered within the memory, at most `SCALE`;
-- a velocity that is rounded towards zero, or always downwards (which of the two a servo does is unknown). In the slow
-  memory, this adds one register step times the excess of time in one direction over the other, or a bias of up to half
-  a step times the time in motion, unless the motion so far rules it out (`hil.experiment.velocity.bias`). While the
-  register shows zero, motion below one step does not count;
+- a velocity that is rounded towards zero, or always downwards (a servo may do either). In the slow memory, rounding
+  towards zero adds one register step times the excess of time in one direction over the other. Rounding downwards adds
+  a bias of up to half a step times the time in motion, which is accepted unless the motion so far rules it out
+  (`hil.experiment.velocity.bias`). While the register shows zero, motion below one step does not count;
 - the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where a
   fraction `CURVED` of the change of velocity times the interval remains. They do not cancel where the velocity jumps:
   in the slow memory, which contains many jumps, their sum is a random walk.
@@ -102,9 +102,10 @@ samples per period, the fastest that is used, needs 0.27.
 """
 
 ROUGH_TIMES = 2.0
-"""Allowance of the slow memory for a velocity that jumps between samples, as when gear teeth change sides: a multiple
-of the root sum of squares of `CURVED` times the interval times the difference between successive velocity changes. A
-jump within an interval causes an RMS error of 0.29 times the jump times the interval, and counts twice.
+"""Allowance of the slow memory for a velocity that jumps between samples, as when gears cross their backlash: a
+multiple of the root sum of squares of `CURVED` times the interval times the difference between successive velocity
+changes. A jump within an interval causes an RMS error of 0.29 times the jump times the interval, and appears in two of
+these differences.
 """
 
 CURVED_AT_FIRST = 0.3
@@ -180,7 +181,7 @@ def begin(memory: Any) -> None:
 def look(memory: Any, position: float, velocity: float, seconds: float, unsure: float) -> bool:
     """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
 
-    unsure: excess duration of its exchange [s], the uncertainty of the measurement time.
+    unsure: excess duration of its exchange [s], which is the uncertainty of the measurement time.
     """
     former, before, also_unsure = memory.position, memory.velocity, memory.unsure
     memory.position, memory.velocity, memory.unsure = position, velocity, unsure

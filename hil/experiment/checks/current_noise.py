@@ -23,17 +23,17 @@ FEWEST_READINGS, MOST_READINGS = 8, 256
 """Number of readings from which noise is first measured, and number of latest readings that are kept."""
 
 _UNCERTAIN = 1.9
-"""Largest underestimate of noise measured from n readings, as a multiple of the true noise divided by sqrt(n)."""
+"""Largest error by which n readings underestimate the noise, as a multiple of the true noise divided by sqrt(n)."""
 
 _MAD_TO_SIGMA = 1.4826
-"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
+"""Ratio of the standard deviation to the median absolute deviation for a normal distribution."""
 
 MOST_NOISE = 0.25
 """Largest accepted noise, relative to the joint's goal limit."""
 
 
 class CurrentNoise:
-    """Standard deviation of the joints' current readings, measured at goals that hardly change.
+    """Standard deviation of the joints' current readings, measured while their goals hardly change.
 
     Every reading is compared with its goal. The median absolute deviation ignores single wrong replies.
     """
@@ -59,7 +59,7 @@ class CurrentNoise:
         return FEWEST_READINGS <= count < MOST_READINGS and count & (count - 1) == 0
 
     def measured(self) -> tuple[list[float], list[float]]:
-        """Return each joint's noise and its upper bound [A or V]; 0 after too few readings."""
+        """Return each joint's noise and its upper bound [A or V]; 0 if there are too few readings."""
         if len(self._errors) < FEWEST_READINGS:
             return [0.0] * len(self._ticks), [0.0] * len(self._ticks)
         errors = np.array(self._errors)
@@ -146,7 +146,7 @@ def _refused(joint: JointConfig, noise: float) -> str:
     if noise <= MOST_NOISE * limit:
         return ""
     return (
-        f"At most {MOST_NOISE * limit:.2g} {joint.drive_mode.goal_unit} RMS is accepted, {100 * MOST_NOISE:.0f} % of "
-        f"{name} ({limit:g}). Check its supply and its cable, or raise {name} if the joint tolerates more; replace the "
-        "servo if this happens again."
+        f"At most {MOST_NOISE * limit:.2g} {joint.drive_mode.goal_unit} RMS is accepted, which is "
+        f"{100 * MOST_NOISE:.0f} % of {name} ({limit:g}). Check its supply and its cable, or raise {name} if the joint "
+        "tolerates more; replace the servo if this happens again."
     )

@@ -3,9 +3,9 @@
 A servo that loses its torque in the middle of a run (reboot, watchdog, another program) carries no current, whatever is
 commanded. All thresholds are relative to the planned peak.
 
-Two hypotheses are compared on every sample, sequentially (E. S. Page, "Continuous inspection schemes", Biometrika 41
-(1954) 100): the current is the one commanded, or it is zero. Their log likelihood ratio, for errors of standard
-deviation sigma, grows by
+On every sample, two hypotheses are compared by a sequential test (E. S. Page, "Continuous inspection schemes",
+Biometrika 41 (1954) 100): the current is the one commanded, or it is zero. Their log likelihood ratio, for errors of
+standard deviation sigma, grows by
 
     [(distance from the commanded current)^2 - (distance from zero)^2] / (2 sigma^2)
 
@@ -17,9 +17,10 @@ Successive errors may be correlated, so each sample is weighted by the time that
 also reach h = `LEAST_RATIO`. From any given check on, a healthy motor's sum does so with a probability of at most
 exp(-h).
 
-While a joint stands still, its readings may also freeze at the commanded current, from which the goal may take seconds
-to move far away. But a motor's current follows its goal: if the readings of position, velocity and current all stay
-exactly the same although the goals that they may reflect (those of the last `ANSWERS_S`) have changed, they are frozen.
+While a joint stands still, its readings may also freeze when its current equals the goal, and it may take seconds
+before the goal is far from this value. But a motor's current follows its goal: if the readings of position, velocity
+and current all stay exactly the same although the goals that they may reflect (those of the last `ANSWERS_S`) have
+changed, they are frozen.
 A constant sensor error cancels in this comparison.
 
 A current sensor may be noisier than assumed. Its noise is measured at constant goals, while the arm rests before the
@@ -85,7 +86,7 @@ GOALS = np.dtype(
 most: largest change of the goal under which all readings may stay the same [A or V]. carried, same_for: current, and
 how long all readings have been the same [s]. age: age of the latest block [s]. low, high: smallest and largest goal in
 each block, the latest first. lowest, highest: smallest upper end and largest lower end of the ranges of goals
-that the readings since then may reflect.
+that the readings may have reflected since they last changed.
 """
 
 MEMORY = np.dtype(

@@ -173,7 +173,7 @@ class JointFaults:
         held = self._status.other_goal(index)
         if held is not None and abs(carried - held) < abs(carried - commanded):
             return (
-                f"Its goal register reads {held:.3f} {unit}, which matches what it carries: another program is "
+                f"Its goal register reads {held:.3f} {unit}, which matches the measured value: another program is "
                 "commanding it, or goals are being altered or lost in transit."
             )
         along = carried if commanded == 0.0 else carried * copysign(1.0, commanded)

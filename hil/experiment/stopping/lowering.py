@@ -35,7 +35,7 @@ LEAVES_RAD = 0.35
 """Largest accepted tracking error [rad]: a joint with a larger one does not follow its path to the rest pose."""
 
 MOST_PATHS = 4
-"""Number of paths home, including the first, that an arm may be pushed off before lowering is abandoned."""
+"""Maximum number of paths home, including the first: if the arm is pushed off the last one, lowering is abandoned."""
 
 LYING_RAD = 0.06
 """If every joint is within this angle of the rest pose [rad], the arm counts as resting in it."""
@@ -230,8 +230,8 @@ class Lowering:
         if turned >= 0:
             raise SafetyStop(
                 f"{self._config.joints[turned].joint.title} is moving against its command: torque that the "
-                "model could not explain vanished when its goal was removed for a moment. Its motor turns the wrong "
-                "way: check its direction and its wiring, and whether another program has changed its Drive Mode.",
+                "model could not explain vanished when the joint's goal was removed for a moment. Its motor turns the "
+                "wrong way: check its direction and wiring, and whether another program has changed its Drive Mode.",
                 Cause.WRONG_SIGN,
             )
         excess = velocity - self._velocity[index]
@@ -260,7 +260,7 @@ class Lowering:
         )
 
     def others_answer(self) -> None:
-        """Record that some unheard servos do answer, but a silent one hides their replies."""
+        """Record that some servos that seem silent do reply, but that a silent servo hides their replies."""
         self._guard.others_answer()
 
     def late(self, seconds: float) -> None:

@@ -57,7 +57,7 @@ class PositionSteps:
 
 
 def _is_step(seen: _Seen, position: float, now: _Seen) -> bool:
-    """Whether a joint could have reached a position neither by moving at its velocities nor by standing still."""
+    """Whether a position can be explained neither by motion at the joint's velocities nor by standstill."""
     seconds = now.time - seen.time
     way = 0.5 * seconds * (seen.velocity + now.velocity)
     unsure = STEP_RAD + 0.5 * BENDS_RAD_S2 * seconds**2

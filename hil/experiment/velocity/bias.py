@@ -1,10 +1,10 @@
 """Bounds on the bias of a servo's velocity reading, inferred from its positions.
 
-With a bias, as from a register rounded downwards, the position departs from the integral of the velocity in proportion
-to the time in motion, just as a creeping position does. But a servo's bias is constant: initially it may be plus or
-minus half a step, and every sample of a run narrows this range, since position and integral cannot be farther apart
-than bias times time plus known errors. Creep that begins later leaves the range and cannot widen it. If twice these
-errors do not explain the distance, the position creeps.
+If the velocity has a bias, for example because a register is rounded downwards, the position departs from the integral
+of the velocity in proportion to the time in motion, just as a creeping position does. But a servo's bias is constant:
+initially it may be plus or minus half a step, and every sample of a run narrows this range, since position and integral
+cannot be farther apart than bias times time plus known errors. Creep that begins later cannot widen it. If no bias in
+the range explains the distance to within twice these errors, the position creeps.
 """
 
 from typing import Any
@@ -33,7 +33,7 @@ def begin(bias: Any) -> None:
 
 
 def look(bias: Any, apart: float, errors: float, moving: float) -> bool:
-    """Process the difference after `moving` seconds of motion [rad, s]; return whether the position creeps.
+    """Process the difference `apart` [rad] after `moving` [s] of motion; return whether the position creeps.
 
     If no bias in the current range explains the difference, the range shrinks to the nearest value.
     """
@@ -45,9 +45,7 @@ def look(bias: Any, apart: float, errors: float, moving: float) -> bool:
 
 
 def unexplained(bias: Any, apart: float, moving: float) -> float:
-    """Return the part of a difference `apart` after `moving` seconds of motion [rad, s] that no bias in the range
-    explains.
-    """
+    """Return the part of the difference `apart` [rad] that no bias in the range explains after `moving` [s]."""
     low = max(bias.least - UNSURE_RAD_S, -0.5 * STEP_RAD_S) * moving
     high = min(bias.most + UNSURE_RAD_S, 0.5 * STEP_RAD_S) * moving
     return float(apart - min(max(apart, low), high))

@@ -29,7 +29,9 @@ LEAST_INFORMATION = 0.1
 """Smallest integral of the squared change of velocity, excluding what a scale error explains [rad^2/s]."""
 
 ENOUGH_INFORMATION, ALL_INFORMATION = 0.3, 3.0
-"""Integrals as in `LEAST_INFORMATION`, over the whole run, above which lag and scale error are known, and frozen."""
+"""Integrals as in `LEAST_INFORMATION`, but over the whole run: above the first, lag and scale error count as known;
+above the second, they are no longer updated.
+"""
 
 SEPARATE = 0.05
 """Fraction of the squared change of velocity that a scale error must leave unexplained to be distinct from a lag."""

@@ -41,7 +41,7 @@ def motion(stiffness: float, slack_at: float) -> tuple[np.ndarray, np.ndarray, n
     ("stiffness", "slack_at", "factor", "zero", "said"),
     [
         (0.0, 0.0, 1.1, None, "without the fitted spring and encoder zero"),
-        (0.0, 0.0, 1.1, HANGING, "if there is one, this model is right"),
+        (0.0, 0.0, 1.1, HANGING, "if the arm has such a spring, this model is right"),
         (0.06, 0.0, 1.0, None, ""),
         (0.06, -0.8, 1.0, HANGING, ""),
     ],

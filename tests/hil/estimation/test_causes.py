@@ -154,7 +154,7 @@ def test_a_torque_without_its_sign_is_no_limit() -> None:
     named = found(replace(healthy(), torque=np.abs(healthy().torque)), healthy().position + 1e-4)
     assert named
     for each in named:
-        assert re.match(r"The torque of joint \d never changes its sign: its column may hold magnitudes", each)
+        assert re.match(r"The torque of joint \d never changes sign: its column may contain only magnitudes", each)
 
 
 def test_no_limit_is_sought_among_torques_that_are_mostly_zero() -> None:

@@ -60,8 +60,7 @@ def named(recordings: Sequence[Recording], model: Model) -> str:
             *("friction", 1.3, "The friction of joint 1 seems to have changed by +", 30.0), marks=pytest.mark.slow
         ),
         pytest.param(
-            *("torque", 0.9, "The motor torque of joint 1, relative to its column, seems to change steadily", -10.0),
-            marks=pytest.mark.slow,
+            *("torque", 0.9, "The motor torque of joint 1 seems to change steadily", -10.0), marks=pytest.mark.slow
         ),
     ],
 )

@@ -49,4 +49,4 @@ def test_a_torque_without_gravity_is_named(gravity_2: tuple[float, float], named
     std = np.array([2e-4, 0.015, 8e-5, gravity_2[1]])
     estimate: Any = SimpleNamespace(parameters=value, names=tuple(value), value=values, std=std)
     found = implausible([SimpleNamespace(joints=0)], estimate, 9.81)  # type: ignore[list-item]
-    assert any("torque does not contain gravity" in said for said in found) is named
+    assert any("torque column does not include gravity" in said for said in found) is named

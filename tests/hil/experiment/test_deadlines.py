@@ -35,11 +35,14 @@ def test_deadlines_missed_in_a_row_count_by_their_number_and_by_the_time_since_t
     for _ in range(20):
         deadlines.missed()  # 20 intervals of 2.5 ms are the 50 ms allowed
     said = said_by(deadlines.missed)
-    assert "21 deadlines in a row were missed, 52 ms without a command; safety.late_time = 0.05 s allows 50 ms" in said
+    assert (
+        "21 deadlines in a row were missed: 52 ms passed without a command; safety.late_time = 0.05 s allows 50 ms"
+        in said
+    )
     assert "atchdog" not in said
     deadlines = Deadlines(arm())
     deadlines.missed(0.0499)
-    assert "20 deadlines in a row were missed, 51 ms without" in said_by(lambda: deadlines.missed(0.051))
+    assert "20 deadlines in a row were missed: 51 ms passed without" in said_by(lambda: deadlines.missed(0.051))
 
 
 def test_a_sample_on_time_begins_the_row_anew(arm: Arm) -> None:

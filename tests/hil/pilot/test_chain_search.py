@@ -550,7 +550,7 @@ def test_a_refusal_names_a_rate_only_if_a_motion_is_safe_at_it(
     monkeypatch.setattr(chain_shares, "OTHER_SEEDS", 0)
     with pytest.raises(NoSafeTorque) as refused:
         search.safe(search.config, (1.0, 0.18))
-    said = f"Simulated at experiment.rate = {named}, a motion is safe. At 50 Hz, delay "
+    said = f"In a simulation at experiment.rate = {named}, a motion is safe. At 50 Hz, delay "
     assert (said in str(refused.value)) is bool(named)
     assert tried[-1].stabiliser == belief.gains(config).at(tried[-1].experiment.rate)
     assert search.given.experiment.rate == 50.0 and search.paths is not None

@@ -62,5 +62,6 @@ def test_a_higher_rate_helps_where_the_stabiliser_is_soft(stiffness: float, time
     """As much as the arms sag too far, but no more than makes the stabiliser as stiff as it gets."""
     said = limit_remedy(LEG, peaks("highest position", 2, 0.6, 1.4), np.array([1.0, 1.0, stiffness]))
     wanted = float(f"{times * LEG.experiment.rate:.2g}")
-    assert f"What helps, alone or together: a rate of about {wanted:g} Hz instead of {LEG.experiment.rate:g}" in said
+    rate = f"a rate of about {wanted:g} Hz instead of {LEG.experiment.rate:g}"
+    assert f"These changes help, alone or together: {rate}" in said
     assert f"{100 * stiffness:.0f} % of its stiffness" in said

@@ -118,7 +118,8 @@ def test_errors_that_repeat_with_the_motion_are_trusted_with_care(setup: bench.S
     arm, found = fitted(setup, residual_over_noise=np.ones(4), systematic=0.9)
     well = _verdict(found, arm, np.full(4, 0.01), setup.prior)
     assert well.trust == "yes"
-    assert well.sentences[0] == f"The largest residual ({setup.arm.joints[0]}) is 1.00 times the noise of its angle."
+    first = setup.arm.joints[0]
+    assert well.sentences[0] == f"The largest residual ({first}) is 1.00 times the noise of that joint's angle."
     found.names, found.value = (*found.names, "torque_scale_2"), np.append(found.value, 0.7)
     found.std = np.append(found.std, 1e-3)
     scaled = _verdict(found, arm, np.full(4, 0.01), setup.prior)
