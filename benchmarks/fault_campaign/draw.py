@@ -226,7 +226,7 @@ class Drawn:
 
 
 def causes_of(drawn: Drawn) -> frozenset[str]:
-    """Causes that a message may name for these faults."""
+    """Causes that a message may correctly name for these faults."""
     own = [CAUSES[each.kind] for each in drawn.faults]
     for each in drawn.attacks:
         is_forged = each.kind in FORGED - {Kind.SWAP, Kind.WRONG_ID}
@@ -235,7 +235,7 @@ def causes_of(drawn: Drawn) -> frozenset[str]:
 
 
 def true_beside(drawn: Drawn) -> frozenset[str]:
-    """What a message may say of these faults although none of it is the cause of a stop."""
+    """What a message may truthfully mention about these faults although it is not the cause of a stop."""
     return frozenset().union(*(BESIDE.get(kind, ()) for kind in drawn.kinds)) - causes_of(drawn)
 
 

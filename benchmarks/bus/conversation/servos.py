@@ -1,4 +1,4 @@
-"""The servos of a conversation as the host knows them, and the registers with rules of their own."""
+"""What the host of a conversation knows about its servos, and the registers that have special rules."""
 
 from dataclasses import dataclass, field
 
@@ -44,8 +44,8 @@ class Still:
 class Servo:
     """One servo as the manual describes it.
 
-    backup: what its backup holds; None without one. alert: whether it has a hardware error. indirect: its indirect
-    data.
+    backup: contents of its backup; None if there is no backup. alert: whether it has a hardware error. indirect: its
+    indirect data.
     """
 
     model: str
