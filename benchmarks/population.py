@@ -121,7 +121,7 @@ def outcome_of(seed: int, arm: DrawnArm, folder: Path) -> Outcome:
 
 
 def _quicker(toml: str) -> str:
-    """Return the file with a fixed friction model and half the rate, which halves the computing time of the fake bus."""
+    """Return the file with a fixed friction model and half the rate, which halves the fake bus's computing time."""
     rate = re.search(r"^rate = ([0-9.]+)", toml, re.MULTILINE)
     assert rate is not None and 'friction = "auto"  ' in toml
     slower = f"rate = {0.5 * float(rate[1]):g}"

@@ -58,7 +58,7 @@ class WrongReply(DriverError):
 class ServoRefused(DriverError):
     """The servo understood an instruction and refused it. Example: writing an EEPROM register while torque is on.
 
-    code: the error number in its status packet; 0 if it merely holds another value than the one written.
+    code: the error number in its status packet; 0 if the servo reported no error but does not hold the value written.
     """
 
     def __init__(self, message: str, code: int = 0) -> None:

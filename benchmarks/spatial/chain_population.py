@@ -49,7 +49,7 @@ SERVOS = (("XM430-W350", 1.8, 1.4), ("XM540-W270", 2.41, 3.5))
 
 @dataclass(frozen=True)
 class Style:
-    """How a file is written. turned: with axes in any direction and turned frames. shape: type of collision geometry."""
+    """How a file is written. turned: axes in any direction and turned frames. shape: type of collision geometry."""
 
     turned: bool = False
     shape: str = "cylinder"
