@@ -128,7 +128,7 @@ class Setup:
 
 
 def set_up(bench: Bench, seed: int) -> Setup:
-    """Draw an arm at random around the description."""
+    """Draw a true arm that differs randomly from the description."""
     rng = np.random.default_rng(seed)
     path = CONFIGS / f"{bench.urdf}.urdf"
     names = [joint.name for joint in read_urdf(path).joints]

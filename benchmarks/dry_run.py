@@ -9,11 +9,12 @@ only, with a pilot and a full run. With --pilots N, N - 1 more arms drawn from t
 within_quantile       share of arms whose measured peaks all stay within the predicted 99 %
 limit_touched         arms that the guard had to stop
 range_used            share of the position range used by the full run's worse joint; smallest of the pilot arms
-std_ratio_pilot_full  worst relative standard error (offsets relative to dry friction) of the pilot over the full run's;
-                      smallest of the pilot arms
-std_ratio_least       the same ratio per parameter, smallest of all
-predicted_over_seen   after the pilot: largest relative deviation of a predicted from a measured peak
-worst_std_ratio       designed over plain multisine, same limits and duration: worst relative standard error
+std_ratio_pilot_full  worst relative standard error (offsets relative to dry friction) after the pilot, divided by that
+                      after the full run; smallest of the pilot arms
+std_ratio_least       the same ratio for each single parameter; smallest of all
+predicted_over_seen   largest relative deviation of a measured peak from the prediction after the pilot
+worst_std_ratio       worst relative standard error with the designed multisine, divided by that with a plain multisine
+                      of the same limits and duration
 """
 
 import argparse

@@ -24,7 +24,7 @@ class DriverError(Exception):
     """Base class of all errors raised by the servo drivers.
 
     last_samples: the last samples that an experiment recorded before the error, if one was running. in_doubt: the
-    registers that may differ from what was to be restored, if all others are known to be restored.
+    registers that may not have been restored, if all others are known to have been restored.
     """
 
     last_samples: object = None

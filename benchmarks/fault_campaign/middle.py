@@ -73,7 +73,7 @@ class Middle(FakeSerial):
         super().__init__(*args, **kwargs)
 
     def attack(self, attacks: Sequence[Attack], seed: int) -> None:
-        """Schedule these attacks; chance is drawn from `seed`."""
+        """Schedule these attacks; their random choices depend on `seed`."""
         self._attacks = attacks
         self._random = Random(seed)
         self._to_come = sorted((each for each in attacks if each.kind in AT_ONCE), key=lambda each: each.start)

@@ -46,7 +46,7 @@ def prepare(attack: Attack, port: "Middle") -> None:
 
 
 def happen(attack: Attack, port: "Middle") -> list[Undo]:
-    """Execute an attack that happens once; return functions that undo changes not caused by the program."""
+    """Execute an attack that happens once; return functions that undo its changes."""
     match attack.kind:
         case Kind.SIGINT | Kind.SIGTERM | Kind.SIGHUP:
             os.kill(os.getpid(), signal.Signals[attack.kind])

@@ -20,8 +20,8 @@ unsafe          at least one of these happened:
                 - A joint overshot its limits by more than lowering the arm may cause.
                 Nothing can end the current after a kill while another program feeds the watchdogs, so this time does
                 not count (`judge.fed_by_another`).
-lying           share of the runs stopped while the arm could still be commanded in which it ended in its rest pose and
-                current was not switched off earlier
+lying           of the runs stopped while the arm could still be commanded, the number in which current was only
+                switched off in the rest pose
 """
 
 import argparse
@@ -103,11 +103,11 @@ LOOKED_AT_MS = 5
 class ChainOutcome:
     """The outcome of one injection.
 
-    owed: why the run had to end, "" if there was no reason. can_command: see above. lies: whether the arm ended in its
-    rest pose. late_ms: how long current flowed after the failure. clearance: least distance while motors drove the arm,
-    minus that of the undisturbed run if the latter is negative [m]. beyond: largest overshoot of a position limit
-    while motors drove the arm [rad]. overruled_ms: longest time for which a motor carried a current that was not
-    commanded; at most `cut_ms` is allowed.
+    owed: why the run had to end, "" if there was no reason. can_command: see above. lies: whether the arm was in its
+    rest pose when current ended. late_ms: how long current flowed after the failure. clearance: least distance while
+    motors drove the arm, minus that of the undisturbed run if the latter is negative [m]. beyond: largest overshoot of
+    a position limit while motors drove the arm [rad]. overruled_ms: longest time for which a motor carried a current
+    that was not commanded; at most `cut_ms` is allowed.
     """
 
     setting: Setting
@@ -245,7 +245,8 @@ def longest_lowering(path: Path) -> float:
 def _leaves_command(drawn: Drawn, ended: float) -> bool:
     """Whether the arm could still be commanded: all faults are of kinds that permit this, and no force held it.
 
-    False after a second request to stop, which asks for torque to be cut at once.
+    Only a force that still acts at the end of the run counts. False after a second request to stop, which asks for
+    torque to be cut at once.
     """
     forced = any(
         each.kind in _BY_FORCE and each.start < ended < each.end and abs(each.amount) > WEAKER for each in drawn.attacks

@@ -189,7 +189,7 @@ def toml_of(
 
 
 def draw(folder: Path, seed: int, plain: bool = False) -> Path:
-    """Draw an arm with a rest pose in which it is clear of everything; return its file."""
+    """Draw an arm and a rest pose in which the arm touches neither itself nor the floor; return its file."""
     random = np.random.default_rng((17, seed))
     style = Style() if plain else Style.draw(np.random.default_rng((18, seed)))
     joints = int(random.integers(3, 7))

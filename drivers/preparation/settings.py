@@ -124,8 +124,8 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
     back.
 
     Raises WrongSetting if torque is on, and TorqueDoubted if EEPROM is locked although torque reads back as off. Raises
-    the errors of `Servo.write` only after all other registers have been tried; the error then has the registers
-    `in_doubt`, and its message names them.
+    the errors of `Servo.write` only after all other registers have been tried; the error's `in_doubt`
+    and message then name the registers that failed.
     """
     _refuse_torque(servo)
     settings = attainable(servo, settings)
