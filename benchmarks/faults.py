@@ -37,7 +37,7 @@ from hil.study import jobs as study_jobs
 INJECTIONS = 5000
 
 _CHEAPNESS = {20: 9, 100: 6, 400: 3, 1000: 1}
-"""Runs per processor time at each rate [Hz]: one takes 0.25 s, 0.4 s, 0.7 s and 2.5 s."""
+"""Relative number of runs per unit of processor time, by rate [Hz]: a run takes 0.25 s, 0.4 s, 0.7 s and 2.5 s."""
 
 
 def campaign(

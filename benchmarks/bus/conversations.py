@@ -71,7 +71,7 @@ def converse(seed: int, models: Iterable[str] = (), most: int = 30) -> Conversat
 
 
 def main() -> None:
-    """Converse, and print what differs."""
+    """Hold the conversations and print the differences."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--conversations", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)

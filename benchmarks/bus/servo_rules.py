@@ -147,7 +147,7 @@ TABLES = {
     "XC430-W150": _table(460, None, (1920, 100, 0, 0, 460), volts=_V24, threshold=20),
     "XC430-W240": _table(306, None, (1920, 100, 0, 0, 700), volts=_V24),
 }
-"""Control table of every X model for 5 to 12 V with one motor, by the pages x/<model>."""
+"""Control table of every X model for 5 to 12 V with one motor, according to the manual's pages x/<model>."""
 
 for _name in [name for name in TABLES if name.startswith("XW")]:  # watertight: without an LED
     TABLES[_name] = tuple(row for row in TABLES[_name] if row.address != LED)

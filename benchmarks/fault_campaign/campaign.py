@@ -58,7 +58,7 @@ _LIMITS_LEFT = frozenset({Kind.KILLED, Kind.LOWERED_LIMIT})
 
 _PACKAGE = "benchmarks.fault_campaign"
 _ARMS = (1, 12)
-"""Arms on which stops are simulated: all are needed only if an overshoot is larger than the first one's."""
+"""Numbers of arms on which stops are simulated: the larger one only if the overshoot exceeds that of the first arm."""
 
 _CHECKED_CYCLES = 8
 """Cycles per mode in the next start's `hil check`, which only has to restore settings here."""

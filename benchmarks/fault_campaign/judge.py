@@ -49,8 +49,8 @@ UNSURE_MS = 20
 """How much earlier than an attack its effect may appear in the record [ms], which is written once the bus is used."""
 
 SHORTEST_WATCHDOG_S = 0.04
-"""Shortest Bus Watchdog that a program can run an arm with [s]: it counts in steps of 20 ms, and one step is less than
-the stall of a busy computer after which an arm can still be lowered.
+"""Shortest practicable timeout of the Bus Watchdog [s], which counts in steps of 20 ms. With one step, the watchdog would
+trip even during a stall of a busy computer after which the arm can still be lowered.
 """
 
 OBEYED = 0.1
@@ -60,15 +60,15 @@ ASTRAY_RAD, ASTRAY_SHARE = 0.1, 0.35
 """Tolerance for the deviation from the undisturbed motion, absolute and relative to the range of that motion."""
 
 DRIVES_MS = 15
-"""Longest time for which a program may command more than ever in the undisturbed run along a visible motion [ms]."""
+"""Longest time for which a goal along a visible motion may exceed all goals of the undisturbed run [ms]."""
 
 DRIVES_SHARE, DRIVES_TICKS, DRIVES_S = 1.2, 5, 0.01
-"""Ratio to the largest goal of the undisturbed run, and smallest change of a position that counts as a visible motion
-[ticks], within this time [s].
+"""Ratio to the largest goal of the undisturbed run above which a goal is too large; smallest change of position that
+counts as visible motion [ticks], and the time within which it must occur [s].
 """
 
 STIRS_RAD = 0.05
-"""Largest motion of a joint between two readings before torque is on that a program may take for a healthy arm's [rad].
+"""Largest motion between two readings before torque is on that a program may attribute to a healthy arm [rad].
 """
 
 TO_BE_SEEN = (
@@ -76,15 +76,15 @@ TO_BE_SEEN = (
     "is not as fast as told",
     "is not where it would be",
 )
-"""Deviations that no program can detect before they show in the replies it receives: not while a healthy arm might have
-sent them (`fault_campaign.twin`).
+"""Deviations that a program can only detect once the replies that it receives differ from all those that a healthy arm
+might have sent (`fault_campaign.twin`).
 """
 
 _TICKS_PER_RAD = 4096 / (2 * np.pi)
 _TICKS_PER_RAD_S = 60 / (2 * np.pi) / 0.229
 
 Numbers = NDArray[np.float64]
-"""A column of a record: with its type stated, checking the types of arithmetic on it takes a tenth of the time."""
+"""A column of a record. Stating its type makes type checking of arithmetic on it ten times as fast."""
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ def _flowed_ms(driven: NDArray[np.float64], since: float) -> float:
 
 
 def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
-    """Whether the message names the cause among at most three causes, and whether it names only wrong ones."""
+    """Whether the message names a true cause among at most three causes, and whether it names only wrong ones."""
     offered = causes_in(text)
     if set(drawn.kinds) <= HARMLESS:
         return False, True  # regardless of the message: the run should not have stopped

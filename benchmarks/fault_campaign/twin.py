@@ -35,8 +35,8 @@ LAGS_S = np.linspace(0.0, LAG_S, 7)[1:]
 """Lags of a velocity that are tried [s]."""
 
 LAGGING_S = 0.2
-"""Time within which the RMS difference of velocities must be ordinary if a lag explains them [s]: it explains them at
-all times, or not at all.
+"""Intervals in each of which the RMS difference of velocities must be ordinary if a lag explains the differences [s]; a
+lag explains them at all times or not at all.
 """
 
 _TICKS_PER_RAD = 4096 / (2 * np.pi)
@@ -49,16 +49,16 @@ _TILT_RAD = 0.2
 _EVALUATIONS = 6
 _STEP = 0.01  # of the finite differences
 _COARSE_S = 0.005
-"""Interval of the replies and commands in the search [s]; the arm it finds is then compared with all of them."""
+"""Interval of the replies and commands that the search uses [s]; the arm found is then compared with all of them."""
 
 _COARSE_STEP_S = 2.5e-3
 """Longest step of the simulation in the search [s]."""
 
 _CORRECTIONS = 3
-"""Steps of Newton's method on all replies, with the search's derivatives, that follow it."""
+"""Number of steps of Newton's method after the search; they use all replies, and derivatives from the search."""
 
 _HOPELESS = 6.0
-"""Multiple of the largest difference of angles at which the search's arm is not followed up."""
+"""If the arm found by the search differs by more than this multiple of `SAME_RAD` in angle, the search is given up."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Heard:
         return self.at(np.flatnonzero(self.time <= end))
 
     def at(self, index: NDArray[np.intp]) -> "Heard":
-        """Only the replies with these indices."""
+        """Return only the replies with these indices."""
         return Heard(self.time[index], self.angle[index], self.velocity[index], self.commanded_at, self.commands)
 
     def every(self, step: float) -> NDArray[np.intp]:

@@ -41,7 +41,7 @@ def over_plain(config: Config) -> float:
 
 
 def identified(name: str) -> dict[str, Any]:
-    """One arm."""
+    """Identify one bundled arm; return its figures."""
     config = load_config(Path(name))
     before = resource.getrusage(resource.RUSAGE_SELF)
     with tempfile.TemporaryDirectory() as folder:

@@ -66,7 +66,7 @@ PERIOD_S = 2.0
 RAMP_S = 1.5
 SWING = 0.4
 SAME_M = 2e-3
-"""Difference of two runs' least clearance that does not count [m]: an arm that lies touches what it lies on."""
+"""Tolerated difference between two runs' least clearances [m]: at rest, an arm touches what it rests on."""
 
 INJECTIONS = 100
 
@@ -90,7 +90,7 @@ COMMANDABLE = _BY_FORCE | {
 """Kinds after which every servo still receives, obeys and reports true values."""
 
 WEAKER = 0.3
-"""Force relative to the largest motor torque of the run that a motor overcomes on the path home in any pose."""
+"""Force that a motor can overcome in any pose on the path home, relative to the largest motor torque of the run."""
 
 SETTLES_S = 1.0
 """Time beyond the predicted lowering that a stop may take [s]."""

@@ -200,7 +200,7 @@ class ReadBack:
         self.overdue_at = min(due, now + pause)
 
     def may_repeat(self, now: float, takes: float) -> bool:
-        """Return whether a lost read-back is to be repeated at once, which takes `takes` [s]."""
+        """Return whether to repeat a lost read-back at once. takes: duration of the repetition [s]."""
         if takes >= self._longest_again or now <= self._repeated_at + TRY_AGAIN_S:
             return False
         self._repeated_at = now
