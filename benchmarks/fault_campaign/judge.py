@@ -49,8 +49,8 @@ UNSURE_MS = 20
 """How much earlier than an attack its effect may appear in the record [ms], which is written once the bus is used."""
 
 SHORTEST_WATCHDOG_S = 0.04
-"""Shortest practicable timeout of the Bus Watchdog [s], which counts in steps of 20 ms. With one step, the watchdog would
-trip even during a stall of a busy computer after which the arm can still be lowered.
+"""Shortest practicable timeout of the Bus Watchdog [s]. It counts in steps of 20 ms, and with one step, it would trip
+even during a stall of a busy computer after which the arm can still be lowered.
 """
 
 OBEYED = 0.1
