@@ -10,14 +10,14 @@ currents to the servo's ticks. One settled period is recorded; a second path is 
 
 Figures for each number of joints, worst of all seeds:
 
-torque_error_percent   rigid-body torque on the held-out path: RMS error over RMS, worst joint
-base_median_percent    median error of the base parameters that make up a tenth of some joint's torque, or more
+torque_error_percent   rigid-body torque on the held-out path: RMS error divided by RMS torque, worst joint
+base_median_percent    median error of the base parameters that contribute at least a tenth of some joint's torque
 residual_ticks         residual of stage 2, worst joint; rounding alone leaves 0.289
-held_out_percent       closed-loop prediction of the held-out motion: RMS error over motion RMS, worst joint
+held_out_percent       closed-loop prediction of the held-out motion: RMS error divided by motion RMS, worst joint
 coverage_95            share of base parameters within their 95 % intervals, over all seeds
-seconds                both stages, compiled, one core; processor_seconds: the same in processor time
-iterations             simulations with all sensitivities
-share_of_classic       ratio of the torque error to that of the classic method, same recording
+seconds                wall time of both stages on one core, without compilation; processor_seconds: processor time
+iterations             number of simulations that include all sensitivities
+share_of_classic       ratio of the torque error to that of the classic method on the same recording
 classic                the same figures for filtered inverse-dynamics least squares: the best of three cut-offs, chosen
                        with the truth known; it has no one-step-ahead residual
 
@@ -128,7 +128,7 @@ class Setup:
 
 
 def set_up(bench: Bench, seed: int) -> Setup:
-    """Draw an arm at random around the description."""
+    """Draw a true arm that differs randomly from the description."""
     rng = np.random.default_rng(seed)
     path = CONFIGS / f"{bench.urdf}.urdf"
     names = [joint.name for joint in read_urdf(path).joints]
@@ -289,7 +289,7 @@ _COMPILED: set[int] = set()
 
 
 def _compiled(joints: int, seed: int) -> dict[str, Any]:
-    """Call `measure`; a worker does so once before its first measurement, so that everything is compiled."""
+    """Call `measure`; in each worker, an extra call first compiles everything."""
     if joints not in _COMPILED:
         measure(joints, 1)
         _COMPILED.add(joints)
@@ -297,7 +297,7 @@ def _compiled(joints: int, seed: int) -> dict[str, Any]:
 
 
 def worst(found: list[dict[str, Any]]) -> dict[str, Any]:
-    """Worst figure of all seeds, None if a seed has none; coverage over all seeds."""
+    """Return the worst of each figure over all seeds (None if it is missing for a seed), but the mean coverage."""
     result: dict[str, Any] = {}
     for key, first in found[0].items():
         each = [one[key] for one in found]

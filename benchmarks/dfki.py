@@ -8,10 +8,11 @@ both predict them for half a second at a time from the same measured states. IDI
 smallest residual. No rule gives its cut-off in advance: `customary` is five times the highest tone (8 Hz),
 `chosen` predicts the sinusoids best, `best` predicts the swing-ups best, which cannot be known in advance.
 
-The encoders are zeroed at every start, when dry friction may hold the arm away from rest: by up to 0.07 rad here, and
-half a second near the upright pose multiplies that by ten. Hence two comparisons: `swing_up` takes the zeros as 0, as a
-reader of the file would; for `swing_up_zeroed`, the two zeros of each half of a swing-up are fitted to the other half
-with fixed parameters, and the better of the two results counts for IDIM-LS.
+The encoders are zeroed at every start, although dry friction may hold the arm away from its rest pose, by up to 0.07
+rad in these recordings. Within half a second near the upright pose, such an error grows tenfold. Therefore, two
+comparisons are made. `swing_up` assumes that the zeros are 0, as a reader of the file would. For `swing_up_zeroed`, the
+two zeros of each half of a swing-up are fitted to the other half with fixed parameters, and the better of the two
+results counts for IDIM-LS.
 
 --floor estimates how much of the error is unavoidable, using the predicted data themselves: encoder zeros
 fitted to each swing-up, and parameters fitted to the swing-ups or to all recordings together.
@@ -144,7 +145,7 @@ def shooting_fit(recordings: list[Recording]) -> ShootingEstimate:
 
 
 def floor(sines: list[Recording], swings: list[Recording], parameters: dict[str, float]) -> dict[str, Any]:
-    """RMS prediction errors of the swing-ups [rad] for fits that use the swing-ups in part or completely."""
+    """RMS prediction errors of the swing-ups [rad] if the swing-ups themselves are used to fit zeros or parameters."""
     errors, _ = prediction_errors(swings, parameters, HORIZON, 2)
     squares = np.sort(np.sum(errors**2, axis=1))[::-1]
     hindsight = np.concatenate([zeros_of(swing, parameters) for swing in swings])

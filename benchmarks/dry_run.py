@@ -2,18 +2,19 @@
 
     python benchmarks/dry_run.py [--json] [--arms N] [--pilots N]
 
-`--arms` arms are drawn from a prior with 30 % spread; each runs, in virtual time, the largest experiment that a dry run
-of that prior allows. The arm of configs/first_time.toml is then identified from joint limits and link lengths only,
-with pilot and full run; with --pilots N, so are N - 1 more arms drawn from the prior; the smallest value counts.
+With --arms N, N arms are drawn from a prior with 30 % spread; each runs, in virtual time, the largest experiment that a
+dry run with this prior allows. Then the arm of configs/first_time.toml is identified from joint limits and link lengths
+only, with a pilot and a full run. With --pilots N, N - 1 more arms drawn from the prior are identified in the same way.
 
 within_quantile       share of arms whose measured peaks all stay within the predicted 99 %
 limit_touched         arms that the guard had to stop
 range_used            share of the position range used by the full run's worse joint; smallest of the pilot arms
-std_ratio_pilot_full  worst relative standard error (offsets relative to dry friction) of the pilot over the full run's;
-                      smallest of the pilot arms
-std_ratio_least       the same ratio per parameter, smallest of all
-predicted_over_seen   after the pilot: largest relative deviation of a predicted from a measured peak
-worst_std_ratio       designed over plain multisine, same limits and duration: worst relative standard error
+std_ratio_pilot_full  worst relative standard error (offsets relative to dry friction) after the pilot, divided by that
+                      after the full run; smallest of the pilot arms
+std_ratio_least       the same ratio for each single parameter; smallest of all
+predicted_over_seen   largest relative deviation of a measured peak from the prediction after the pilot
+worst_std_ratio       worst relative standard error with the designed multisine, divided by that with a plain multisine
+                      of the same limits and duration
 """
 
 import argparse
@@ -60,7 +61,7 @@ def pilot_study(pilots: int, seed: int = 2, jobs: int | None = None) -> dict[str
 
 
 def _pilot(config: Config) -> tuple[float, float, float, float] | None:
-    """Range used, ratios of standard deviations, and distance of the prediction of one arm; None if it was stopped."""
+    """Range used, ratios of standard deviations, and prediction error for one arm; None if the arm was stopped."""
     with fake_of(config) as (drawn, folder):
         run = RunFolder.create(folder / "run", drawn)
         try:
@@ -83,7 +84,7 @@ def _pilot(config: Config) -> tuple[float, float, float, float] | None:
 
 
 def first_estimate(run: Path) -> SettledResult:
-    """Estimate from the last pilot, the first one in which every joint moved."""
+    """Estimate from the last pilot run, which is the first in which every joint moved."""
     last = sorted(run.glob("pilot-*"), key=lambda path: int(path.name.removeprefix("pilot-")))[-1]
     return estimate_run(RunFolder.open(last))
 

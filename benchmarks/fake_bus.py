@@ -3,7 +3,8 @@
     python benchmarks/fake_bus.py [--json] [--seconds S] [--config CONFIG]
 
 - `times_real_time`: hil's own stream (guard, recorder, drivers) on the realistic two-link arm at 400 Hz, in virtual
-  time: arm time over CPU time, best of five runs. `bus_share_us`, `plant_share_us`: time of bus and plant per cycle.
+  time: arm time divided by CPU time, best of five runs. `bus_share_us`, `plant_share_us`: time of bus and plant per
+  cycle.
 - `servos_us`: one control cycle of the bus alone, with a trivial plant, for one to six servos.
 - `pty_*`: `hil fake --pty` in a separate process, and a client here that writes goals and reads states 1000 times a
   second for S seconds at 4 Mbaud (at 1 Mbaud, transferring the bytes of a cycle takes more than a millisecond).

@@ -6,15 +6,16 @@ Each injection is one `hil record` in virtual time with one or two faults: of th
 programs on the bus, or by a man in the middle who changes, delays, repeats, forges and drops bytes between program and
 servos. It is judged by the emulated servos' own record of every millisecond (fault_campaign/judge.py):
 
-unsafe          current flowed for more than 100 ms (or the watchdog's timeout, if the program cannot reach the servo)
-                after the first permanent failure, or at all after the end of the program
-alike           not unsafe, but only because a healthy arm was found that would have sent the same replies until then,
-                so that nothing could be detected (fault_campaign/twin.py)
+unsafe          current flowed for more than 100 ms after the first permanent failure (for more than the watchdog's
+                timeout if the program cannot reach the servo), or still flowed after the end of the program
+alike           current flowed for too long, but a healthy arm would have sent the same replies until shortly before
+                its end, so nothing could be detected and the run does not count as unsafe (fault_campaign/twin.py)
 beyond_limit    a joint overshot its limit by more than `hil dry-run` predicts
 unreadable      an unexpected exception, no message, or a recording that cannot be read
-unnamed         the message does not name the cause, judged by words for all causes; misleading: it names only others
+unnamed         the message does not name the cause, as judged by lists of words for each cause
+misleading      the message names only other causes
 not_restored    a register differs from its value before the run, even after the next start
-worst_ms_with_current   longest time for which current flowed after that moment [ms]
+worst_ms_with_current   longest time for which current flowed after the first permanent failure [ms]
 """
 
 import argparse
@@ -36,7 +37,7 @@ from hil.study import jobs as study_jobs
 INJECTIONS = 5000
 
 _CHEAPNESS = {20: 9, 100: 6, 400: 3, 1000: 1}
-"""Runs per processor time at each rate [Hz]: one takes 0.25 s, 0.4 s, 0.7 s and 2.5 s."""
+"""Relative number of runs per unit of processor time, by rate [Hz]: a run takes 0.25 s, 0.4 s, 0.7 s and 2.5 s."""
 
 
 def campaign(
@@ -48,9 +49,9 @@ def campaign(
     *,
     even: bool = True,
 ) -> tuple[list[Outcome], list[str]]:
-    """Distribute the injections among the settings; return their outcomes, and why settings could not be run.
+    """Distribute the injections among the settings; return the outcomes, and the reasons why settings could not be run.
 
-    even: the same number for every setting; otherwise fewer for high rates, whose runs take longest.
+    even: give every setting the same number; otherwise, give fewer to high rates, whose runs take longest.
     """
     shares = _shares([1 if even else _CHEAPNESS[each.rate] for each in chosen], injections)
     parts = [(setting, share, first, period) for setting, share in zip(chosen, shares, strict=True)]

@@ -1,11 +1,12 @@
-"""Lateness of a loop at a fixed rate: ours compared with `time.sleep(dt)`.
+"""Lateness of hil's fixed-rate loop, compared with a loop that calls `time.sleep(dt)`.
 
     python benchmarks/fixed_rate.py                  10 s of each loop at 500 Hz and at 1 kHz
     python benchmarks/fixed_rate.py --seconds 60 --json
 
 Lateness is the time from a deadline to the moment at which its work can begin. Drift is the difference in lateness
-between the last and the first deadlines of a run. The top level of the JSON object holds our loop's worst values over
-both rates. Our loop is also stalled deliberately for ten and a half periods: it must count nine missed deadlines.
+between the last and the first deadlines of a run. The top level of the JSON object holds the worst
+values of hil's loop over both rates. This loop is also stalled deliberately for ten and a half periods; it must then
+count nine missed deadlines.
 """
 
 import argparse

@@ -2,9 +2,9 @@
 
     python benchmarks/friction_models.py [--json] [--seeds N]
 
-The arm of configs/fake_two_link.toml with dry friction that grows by 5 % of the motor's torque; `ripple` adds 2 % of
-torque ripple over the angle, and `presliding` adds presliding friction of about 3 mrad. The model is chosen by hil
-(`friction = "auto"`). The figures are the worst of N seeds; seeds for which the guard stops the arm are counted and
+The arm is that of configs/fake_two_link.toml, with dry friction that grows by 5 % of the motor's torque; `ripple` adds
+2 % of torque ripple over the angle, and `presliding` adds presliding friction of about 3 mrad. The model is chosen by
+hil (`friction = "auto"`). The figures are the worst of N seeds; seeds for which the guard stops the arm are counted and
 skipped.
 """
 

@@ -2,8 +2,9 @@
 
     python benchmarks/growth.py [--json] [--most N]
 
-One settled period of the ideal arm, 4,000 to 1,000,000 samples at 400 Hz with the same number of lines, each size in a
-separate process. The motion comes from the estimator's own simulation, rounded to encoder steps: only time is measured.
+Each measurement uses one settled period of the ideal arm, with 4,000 to 1,000,000 samples at 400 Hz but always the same
+number of excited frequencies, and runs in a separate process. The motion comes from the estimator's own simulation,
+rounded to encoder steps, since only time and memory are measured, not accuracy.
 """
 
 import argparse
@@ -36,7 +37,7 @@ PEAK = (0.50, 0.30)  # N m; never beyond the upright pose, where a long motion w
 
 
 def period_of(samples: int) -> SettledPeriod:
-    """A period with LINES lines per joint up to 5 Hz, whatever its length."""
+    """Return a period of any length with LINES excited frequencies per joint, all below 5 Hz."""
     period = samples / RATE
     # Random lines: evenly spaced ones have a common factor and would repeat one short period, including rounding.
     drawn = np.random.default_rng(1).choice(np.arange(1, round(5.0 * period)), 2 * LINES - 1, replace=False)

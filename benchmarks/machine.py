@@ -1,4 +1,4 @@
-"""The date and machine of a measurement on one line."""
+"""Return the date and the machine of a measurement as one line."""
 
 import os
 import platform

@@ -2,11 +2,12 @@
 
     python benchmarks/monte_carlo.py [--json] [--seeds N]
 
-The ideal fake arm (smooth Coulomb and viscous friction, written in masses and lengths, not in the estimator's
-equations), one settled period of 10 s at 400 Hz, 0.80 and 0.42 N m. Each seed draws new errors of position:
-normal errors of half an encoder step, then rounding to steps with a random zero. The bound assumes white errors with
-the variance of both. The seeds cycle through WAVES multisines. `rounding_only` is the same without the normal errors,
-as for a good encoder, whose rounding errors are not white where a joint moves slowly.
+The recording is one settled period of 10 s at 400 Hz with peak torques of 0.80 and 0.42 N m. The arm is the ideal fake
+arm with smooth Coulomb and viscous friction; its equations use masses and lengths and are independent of the
+estimator's. Each seed draws new position errors: normal errors of half an encoder step, then rounding to steps with a
+random zero. The bound assumes white errors with the variance of both together. The seeds cycle through WAVES
+multisines. `rounding_only` gives the same figures without the normal errors, as for a good encoder; its rounding errors
+are not white where a joint moves slowly.
 """
 
 import argparse

@@ -1,11 +1,12 @@
-"""The seed paper's arm: its method as printed and maximum likelihood on the same data, and its figures 2 to 5.
+"""The seed paper's method as printed, compared with maximum likelihood on the same data; the paper's figures 2 to 5.
 
     python benchmarks/paper.py [--json] [--seeds N] [--figures DIR]
 
-The arm of Table 1, with the amplitudes of Table 2 on separate lines for each joint, the paper's noise, 100 s at 100 Hz.
-`rmse_m1`, `rmse_m2` [kg] are the likelihood's over N seeds on the plant as printed (first order);
-`literal_rmse_m1`, `literal_rmse_m2` are those of the method as printed. For comparison: the Cramer-Rao bound, the
-corrected plant (second order with friction), and 10 samples per second. The figures need matplotlib.
+The data are 100 s at 100 Hz of the arm of Table 1 with the paper's noise; the amplitudes are those of Table 2, at
+different frequencies for the two joints. `rmse_m1` and `rmse_m2` [kg] are the errors of maximum likelihood over N seeds
+on the plant as printed (first order); `literal_rmse_m1` and `literal_rmse_m2` are those of the method as printed. For
+comparison, the output also gives the Cramer-Rao bound, and results for the corrected plant (second order with friction)
+and for 10 samples per second. The figures need matplotlib.
 """
 
 import argparse
@@ -45,7 +46,7 @@ GUESS = PaperArm(mass_1=3.5, mass_2=1.0, viscous=2.0)
 
 
 def rmse(rate: float, seeds: int, order: Order) -> tuple[Array | None, Array | None]:
-    """Root mean square errors of the masses (2,) [kg]: as printed (first order only), and of the likelihood."""
+    """RMS errors of the masses (2,) [kg]: of the method as printed (first order only), and of maximum likelihood."""
     excitation = own_lines()
     literal: list[tuple[float, float]] = []
     likely: list[tuple[float, float]] = []

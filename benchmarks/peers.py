@@ -1,19 +1,19 @@
-"""Every method on two recordings: error, held-out prediction, time.
+"""Comparison of all methods on two recordings: error, held-out prediction, time.
 
     python benchmarks/peers.py [--json] [--seed N]
 
-`seconds`, `worst_relative_error` and `held_out_rms`, each by method, on the default demo recording (4,000 samples of
-two joints); under `textbook` the same on the arm of configs/fake_two_link_ideal.toml. The worst relative error is
+`seconds`, `worst_relative_error` and `held_out_rms` are given by method for the default demo recording (4,000 samples
+of two joints), and under `textbook` for the arm of configs/fake_two_link_ideal.toml. The worst relative error is taken
 over inertias, gravity, viscous and Coulomb friction. The tuning of each peer is described in
 estimator/baselines/compare.py and hil/estimation/comparison/mujoco_peer.py; mujoco.sysid is included if it is installed
 (extra `peers`), with an initial guess within 50 % of the truth.
 
 Times are medians of three runs of each method in one process, after one run for compilation, and exclude building the
-model and residual of mujoco.sysid. On the demo, `hil` fits the Stribeck friction and current lag of its configuration,
-which take time; mujoco.sysid is limited to Coulomb friction, and so is `hil_coulomb`, and neither can fit that arm
-completely. On the textbook arm, all three methods and the arm itself have Coulomb friction, so the times are for the
-same work. mujoco.sysid distributes its rollouts over all cores, and hil two or three of its fits, so the ratio is
-meaningful only on an idle machine.
+model and residual of mujoco.sysid. On the demo recording, `hil` also fits the Stribeck friction and current lag of the
+configuration, which takes additional time; `hil_coulomb` and mujoco.sysid are limited to Coulomb friction, so neither
+can fit that arm completely. The textbook arm has Coulomb friction, and so have all three models there, so the times are
+for the same work. mujoco.sysid distributes its rollouts over all cores, and hil distributes two or three of its fits,
+so the ratio is meaningful only on an idle machine.
 """
 
 import argparse
@@ -82,7 +82,7 @@ def _by_key(methods: dict[str, MethodResult]) -> dict[str, Any]:
 
 
 def worst(found: MethodResult) -> float:
-    """Relative error of the worst parameter; all arms here are fake ones."""
+    """Relative error of the worst parameter; the true values are known, since all arms here are fake."""
     assert found.worst_relative_error is not None
     return found.worst_relative_error
 

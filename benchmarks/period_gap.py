@@ -4,8 +4,8 @@
 
 The stream runs for two periods at 1 kHz, including guard, model, recorder and comparison of periods, on a substitute
 for the bus that answers immediately. The measured time is the processor time of the stream's thread from the end of an
-exchange to the beginning of the next; it excludes other programs but would include any work on a complete period.
-The output gives the longest time, the longest time at the ends of periods, and how much of it exceeds the interval
+exchange to the beginning of the next; it excludes other programs but would include any work on a complete period. The
+output gives the longest time, the longest time at the ends of periods, and by how much the latter exceeds the interval
 minus the wire time of an exchange. Because stalls of a virtual machine count as processor time too, the longest
 iteration of a counting loop with the same median time and number of iterations is printed for comparison.
 """
@@ -39,7 +39,7 @@ EXCHANGE_S = 0.39e-3
 
 
 class StandIn:
-    """A bus whose joints follow their current like masses on springs driven by it."""
+    """A substitute for the bus, whose joints are deflected in proportion to their current."""
 
     def __init__(self, config: Config, clock: VirtualClock, swing: float) -> None:
         self.joints = config.bus.joints
@@ -76,7 +76,7 @@ class StandIn:
 
 
 def measure(rate: float, period: float) -> dict[str, Any]:
-    """Measured figures in ms."""
+    """Run the measurement; return its figures [ms]."""
     config = load_config(CONFIG)
     config = config.model_copy(
         update={"experiment": config.experiment.model_copy(update={"rate": rate, "period": period, "held_out": False})}
@@ -127,7 +127,7 @@ def measure(rate: float, period: float) -> dict[str, Any]:
 
 
 def _machine_longest(turns: int, median_ms: float) -> float:
-    """Longest of `turns` iterations of a loop that counts for about `median_ms` [ms of processor time]."""
+    """Longest of `turns` runs of a counting loop that takes about `median_ms` [ms of processor time]."""
     counts = 100
     while True:
         started = time.thread_time_ns()

@@ -8,14 +8,15 @@ of the fake arm. --quick: friction = "stribeck" instead of "auto" and half the r
 
 finished              share that ended with a result
 beyond_limit          arms that overshot a position limit by more than hil.dry_run.stopping_distance predicts
-yes, yes_current, yes_pwm   share with the verdict "yes": of all arms, those with current sensors, voltage-driven ones
-yes_but_wrong         share of the "yes" with an inertia, gravity or friction parameter off by more than 2 % and by more
-                      than 3 standard errors. All torques are in units of the first joint's torque constant; warming
-                      friction is evaluated in the middle of the fitted periods
-worst_percent_of_yes  largest such error of a "yes" [%]
-held_out_percent      largest held-out prediction error among the "yes", and its median [% of motion RMS]
-held_out_as_fitted_percent   the same with friction as it was in the fitted motion, where it has changed since: the
-                      above takes one factor per joint from the held-out motion itself
+yes, yes_current, yes_pwm   share with the verdict "yes": of all arms, of those with current sensors, and of those that
+                      are voltage-driven
+yes_but_wrong         share of the "yes" verdicts with an inertia, gravity or friction parameter that is off by more
+                      than 2 % and by more than 3 standard errors. All torques are in units of the first joint's torque
+                      constant; warming friction is evaluated in the middle of the fitted periods
+worst_percent_of_yes  largest such error of an arm with the verdict "yes" [%]
+held_out_percent      largest and median held-out prediction error of these arms [% of motion RMS]; where friction has
+                      changed, one factor per joint is fitted to the held-out motion
+held_out_as_fitted_percent   the same without this factor, i.e. with friction as in the fitted motion
 cpu_seconds_*         processor time of the whole process
 arm_seconds_median    time for which the arm was driven
 """
@@ -58,7 +59,7 @@ NOTHING = 1e-9  # N m
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome for one arm; errors: of each judged parameter, relative and in standard errors."""
+    """The outcome for one arm. errors: relative error and error in standard errors of each judged parameter."""
 
     seed: int
     name: str
@@ -120,7 +121,7 @@ def outcome_of(seed: int, arm: DrawnArm, folder: Path) -> Outcome:
 
 
 def _quicker(toml: str) -> str:
-    """Return the file with fixed friction and half the rate: most processor time is the fake bus's, in proportion."""
+    """Return the file with a fixed friction model and half the rate, which halves the fake bus's computing time."""
     rate = re.search(r"^rate = ([0-9.]+)", toml, re.MULTILINE)
     assert rate is not None and 'friction = "auto"  ' in toml
     slower = f"rate = {0.5 * float(rate[1]):g}"
@@ -169,7 +170,7 @@ def _motion(config: Config, folder: Path) -> tuple[float, int, float, float]:
 
 
 def _predicted(config: Config, at: np.void) -> float:
-    """Predicted overshoot beyond a limit when stopped at this sample [rad]."""
+    """Predicted overshoot beyond a limit if the arm is stopped at this sample [rad]."""
     most = [0.97 * joint.goal_limit * joint.torque_per_goal for joint in config.joints]
     experiment = config.experiment.model_copy(update={"peak_torque": most})
     plan = make_plan(config.model_copy(update={"experiment": experiment}))
@@ -178,7 +179,7 @@ def _predicted(config: Config, at: np.void) -> float:
 
 
 def _truth(config: Config, folder: Path) -> dict[str, float]:
-    """True parameters in the middle of the fitted periods: friction falls while grease warms."""
+    """True parameters in the middle of the fitted periods, since friction falls while grease warms."""
     truth = true_parameters(config)
     assert truth is not None and config.fake is not None
     samples = load_samples(folder / "samples.npy", len(config.joints))
@@ -254,7 +255,7 @@ def figures(outcomes: list[Outcome]) -> dict[str, Any]:
 def study(
     seeds: list[int], jobs: int, keep: Path | None, tell: Any = None, *, quick: bool = False, others: bool = False
 ) -> list[Outcome]:
-    """Identify the arm of each seed; tell: called with each outcome."""
+    """Identify the arm of each seed. tell: function that is called with each outcome."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = (keep or Path(temporary)).absolute()
         return each(partial(_run_in, folder, quick, others), seeds, count=jobs, tell=tell or (lambda _: None))

@@ -2,11 +2,11 @@
 
     python benchmarks/rigid_body_engine.py [--json] [--seeds N]        (needs the package mujoco)
 
-The links, servos and friction of the fake arm are MuJoCo bodies; dry friction is a constraint there (frictionloss), not
-a function of velocity. Positions are rounded to encoder steps and currents to current steps. The friction model is
-chosen by hil. The output gives the worst of N seeds, and how many of the N x 12 parameters lie outside their 99 %
-intervals (1 % is expected). Seeds whose phases swing the arm over the top, in the fitted or the held-out period, are
-counted and skipped, because the motion is then not periodic.
+The links, servos and friction of the fake arm are modelled in MuJoCo, where dry friction is a constraint
+(frictionloss), not a function of velocity. Positions are rounded to encoder steps and currents to current steps. The
+friction model is chosen by hil. The output gives the worst of N seeds, and how many of the N x 12 parameters lie
+outside their 99 % intervals (1 % is expected). Seeds whose phases swing the arm over the top, in the fitted or the
+held-out period, are counted and skipped, because the motion is then not periodic.
 """
 
 import argparse
@@ -69,7 +69,7 @@ def engine() -> mujoco.MjModel:
 
 
 def record(seed: int) -> SettledPeriod:
-    """Simulate one period to settle and return the next one."""
+    """Simulate one period for settling; return the next one."""
     wave = design_multisine(RATE, PERIOD, zippered_lines(PERIOD, BAND, 2), PEAK, seed)
     constant = SERVO["torque_constant"]
     torque = np.round(wave.torque / constant / CURRENT_STEP) * CURRENT_STEP * constant

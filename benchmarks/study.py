@@ -2,18 +2,19 @@
 
     python benchmarks/study.py [--runs 200] [--empty 10000] [--killed 50] [--only PART ...] [--json]
 
-Parts: speed (one, two and four workers), empty, killed; all of them take a quarter of an hour on two quiet cores.
+The parts are speed (one, two and four workers), empty and killed; together, they take a quarter of an hour on two idle
+cores.
 
-speedup_2         wall time with one worker over that with two, for the same short identifications
+speedup_2         wall time with one worker divided by that with two, for the same short identifications
 overhead_ms       wall time of an empty run with one worker, scheduler and writer included [ms]
 same              whether 1, 2 and 4 workers, and the study that was killed, give exactly the same rows,
                   except for timings
-lost_after_kill   rows missing or duplicated after killing a worker five times, the engine once (then --resume)
+lost_after_kill   rows missing or duplicated after a worker is killed five times and the engine once (then --resume)
 bytes_a_run       Parquet size per identification with the default columns
 worker_mb         largest memory of a worker in the empty runs; scheduler_mb: of the process with scheduler and
-                  writer; *_growth: from their first tenth to their end
-rows              of the empty runs, all of them
-seconds_a_run     processor time of a short identification, and the wall time of all of them with 1, 2 and 4 workers
+                  writer; *_growth: increase from the first tenth of the runs to the end
+rows              number of rows of the empty runs; -1 if it is wrong
+seconds_a_run     processor time of a short identification, and wall time per identification with 1, 2 and 4 workers
 """
 
 import argparse
@@ -61,7 +62,7 @@ def study_file(folder: Path, text: str) -> Path:
 
 
 def timed(path: Path, out: Path, workers: int) -> tuple[float, Dataset]:
-    """Return the wall time per run [s] and the rows; without each worker's first run, which compiles."""
+    """Return the wall time per run [s] and the rows; excludes each worker's first run, which includes compilation."""
     seen: list[float] = []
     dataset = run_study(load_study(path), out, worker_count=workers, watch=lambda _: seen.append(time.perf_counter()))
     first = min(2 * workers, len(seen) - 1) - 1
@@ -102,7 +103,7 @@ def memory_mb(pid: int) -> float:
 
 
 def speed(folder: Path, runs: int) -> dict[str, Any]:
-    """The same identifications with 1, 2 and 4 workers."""
+    """Compare the same identifications with 1, 2 and 4 workers."""
     path = study_file(folder, IDENTIFY.format(runs=runs))
     seconds, tables, cpu = {}, {}, 0.0
     for workers in (1, 2, 4):
@@ -119,7 +120,7 @@ def speed(folder: Path, runs: int) -> dict[str, Any]:
 
 
 def empty_runs(folder: Path, runs: int) -> dict[str, Any]:
-    """Time and memory of runs that do nothing."""
+    """Measure time and memory of runs that do nothing."""
     path = study_file(folder, EMPTY.format(runs=runs))
     memory: list[tuple[float, float]] = []
     seen: list[float] = []
@@ -144,8 +145,8 @@ def empty_runs(folder: Path, runs: int) -> dict[str, Any]:
 
 
 def killed(folder: Path, runs: int) -> dict[str, Any]:
-    """Rows lost or duplicated when workers are killed `KILLS` times and then the engine itself, and the study
-    resumed.
+    """Count the rows that are lost or duplicated when workers are killed `KILLS` times, then the engine is killed and
+    the study is resumed.
     """
     path = study_file(folder, IDENTIFY.format(runs=runs))
     out = folder / "out"

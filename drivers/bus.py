@@ -295,7 +295,7 @@ class ServoBus(TorqueSwitch):
     def exchange(self, goals: Sequence[float], *, between: bool = False) -> State:
         """Send goals, one per joint [A, or V in PWM mode], and return the arm's state.
 
-        between: whether this exchange lies between two samples (`Exchange.cycle`).
+        between: whether this is an extra exchange between two samples (`Exchange.cycle`).
         A servo that does not reply is marked as missing. Raises PortLost; BusOverheard if packets from another master
         are heard repeatedly; WrongReply if servos repeatedly answer with each other's ID; ValueError for a goal that is
         not a finite number.
@@ -314,10 +314,10 @@ class ServoBus(TorqueSwitch):
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def first_hides_others(self, patience: float) -> bool:
-        """Return whether only the first servo is silent, masking the replies of the others. Raises PortLost.
+        """Return whether the first servo is silent although the last one replies. Raises PortLost.
 
-        In a group read, a silent servo masks the replies of those after it. The last servo is therefore read first,
-        then the first servo. patience: how long to wait for their replies [s].
+        In a group read, a silent servo prevents the replies of all servos listed after it. The last servo is
+        therefore read before the first. patience: how long to wait for the replies [s].
         """
         drives = (self._drives[-1], self._drives[0])
         read = SyncRead([each.id for each in drives], Span.of([self._servos[each].table for each in drives], ["ID"]))
@@ -360,7 +360,7 @@ class ServoBus(TorqueSwitch):
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """Index of a joint that has missed many of the latest goals, and a text on the value read back; or None."""
+        """Index of a joint that has missed many of the latest goals, and text about the value read back; or None."""
         if (lost := self.prepared.lost) is None:
             return None
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"

@@ -24,7 +24,7 @@ class DriverError(Exception):
     """Base class of all errors raised by the servo drivers.
 
     last_samples: the last samples that an experiment recorded before the error, if one was running. in_doubt: the
-    registers that may differ from what was to be restored, if all others are known to be restored.
+    registers that may not have been restored, if all others are known to have been restored.
     """
 
     last_samples: object = None
@@ -58,7 +58,7 @@ class WrongReply(DriverError):
 class ServoRefused(DriverError):
     """The servo understood an instruction and refused it. Example: writing an EEPROM register while torque is on.
 
-    code: the error number in its status packet; 0 if it merely holds another value than the one written.
+    code: the error number in its status packet; 0 if the servo reported no error but does not hold the value written.
     """
 
     def __init__(self, message: str, code: int = 0) -> None:

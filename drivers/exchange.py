@@ -352,9 +352,9 @@ class _Plan:
     """One of the group reads of an exchange.
 
     span: the span that a Reply reports. reply_time: how long to wait for the replies. pack_behind: packs the goals' CRC
-    and the request. wire_s: wire time of goals, request and replies [s]. soonest: time from the start of a cycle before
-    which a complete reply may belong to an earlier request [s]. is_after_loss: whether a late reply may be on the wire
-    when this read is sent, and may destroy the goals.
+    and the request. wire_s: wire time of goals, request and replies [s]. soonest: if a complete reply arrives within
+    this time after the start of the cycle, it may belong to an earlier request [s]. is_after_loss: whether a late reply
+    may be on the wire when this read is sent, and may destroy the goals.
     """
 
     read: GroupRead

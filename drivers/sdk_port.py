@@ -1,5 +1,5 @@
 """Replacements for two classes of `dynamixel-sdk`: a port handler on top of an open `Port`, and a packet handler that
-finds a reply despite preceding noise.
+finds a reply despite noise before it.
 """
 
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, Protocol2PacketHandler
@@ -126,8 +126,8 @@ class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 def _first_status(received: bytes) -> tuple[bytes, int]:
     """Return the first intact status packet among the received bytes, and 0 as the number of bytes to read next.
 
-    If there is none, return b"" and at most the length of the rest of the packet that has begun, so that the next
-    packet stays whole.
+    If there is none, return b"" and a number of bytes to read that does not reach beyond the incomplete packet, so that
+    the next packet is not split.
     """
     missing = _SHORTEST - next(size for size in range(len(HEADER) - 1, -1, -1) if received.endswith(HEADER[:size]))
     at = received.find(HEADER)

@@ -105,8 +105,8 @@ class Servo:
         return entry.decode(bytes(self._try(f"reading {entry.name}", ask, attempts, is_read=True)))
 
     def write(self, register: str, value: int, attempts: int | None = None) -> None:
-        """Write a register and read it back. Raises the errors of `read`, and ServoRefused if another value is read
-        back.
+        """Write a register and read it back. Raises the errors of `read`, and ServoRefused if it reads back as a
+        different value.
 
         attempts: maximum number of attempts at the write, and then at the read; by default, as for all set-up work.
         """

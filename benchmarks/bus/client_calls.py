@@ -1,6 +1,6 @@
-"""Calls of one client against a fake arm, with their results as one JSON line; arguments: CLIENT DEVICE.
+"""Call one client's functions on a fake arm; print the results as one line of JSON. Arguments: CLIENT DEVICE.
 
-This script runs in any environment that has the client and needs nothing of hil; `benchmarks/bus/clients.py` calls
+This script runs in any environment that has the client and does not import hil; `benchmarks/bus/clients.py` calls
 it. A call is wrong if it raises or if its result differs from that of a real servo.
 """
 
@@ -284,7 +284,7 @@ def lerobot_koch(device: str) -> Iterator[Call]:
 
 
 def lerobot_shadows(device: str) -> Iterator[Call]:
-    """Calls of LeRobot on viperx_300: an arm as in ALOHA, with shadow servos that follow through their Secondary ID."""
+    """Calls of LeRobot on viperx_300: the arm of ALOHA, whose shadow servos obey commands to their Secondary ID."""
     from lerobot.motors import Motor, MotorNormMode
     from lerobot.motors.dynamixel import DynamixelMotorsBus
 
@@ -326,7 +326,7 @@ CLIENTS: dict[str, tuple[Callable[[str], Iterator[Call]], str]] = {
 
 
 def run(name: str, device: str) -> dict[str, Any]:
-    """Results of one client's calls; `missing` if it is not installed here."""
+    """Return the results of one client's calls, or `missing` if the client is not installed in this environment."""
     calls, package = CLIENTS[name]
     try:
         version = importlib.metadata.version(package)

@@ -1,11 +1,11 @@
 """Independent clients on the fake bus over a pseudo-terminal, with the result of every call.
 
-    python benchmarks/bus/clients.py                                    runs those installed in this environment
-    python benchmarks/bus/clients.py --python /path/to/venv/bin/python  and those there (LeRobot needs its own)
-    python benchmarks/bus/clients.py --write                            updates the table in docs/fake-bus.md
+    python benchmarks/bus/clients.py                                    the clients installed in this environment
+    python benchmarks/bus/clients.py --python /path/to/venv/bin/python  also those of that one (LeRobot needs its own)
+    python benchmarks/bus/clients.py --write                            update the table in docs/fake-bus.md
     python benchmarks/bus/clients.py --json                             one JSON object, with every call
 
-The clients' calls are in `client_calls.py`, which needs nothing of hil.
+The clients' calls are in `client_calls.py`, which does not import hil.
 """
 
 import argparse

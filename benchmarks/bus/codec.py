@@ -1,6 +1,7 @@
-"""Protocol 2.0 as its manual describes it, written without hil's own encoder: the host of `conversations`.
+"""Protocol 2.0 as its manual describes it, independent of hil's own encoder; used by the host of `conversations`.
 
-Nothing here is fast: the CRC is computed bit by bit, and a status is decoded only if every byte of it is right.
+The code is simple rather than fast: the CRC is computed bit by bit. A status is decoded only if all its bytes are
+correct.
 """
 
 from typing import NamedTuple
@@ -24,11 +25,11 @@ class Status(NamedTuple):
 
 
 class Wrong(Exception):
-    """What was received is no sequence of status packets."""
+    """The received bytes are not a sequence of status packets."""
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16 with the polynomial 0x8005, not reflected, from 0."""
+    """CRC-16 with the polynomial 0x8005, not reflected, initial value 0."""
     value = 0
     for byte in data:
         value ^= byte << 8
@@ -50,7 +51,7 @@ def packet(servo_id: int, instruction: int, parameters: bytes = b"", *, damage: 
 
 
 def statuses(received: bytes) -> list[Status]:
-    """The status packets of which `received` consists; raises Wrong if there is anything else."""
+    """Split `received` into status packets; raise Wrong if it contains anything else."""
     found = []
     while received:
         if not received.startswith(HEADER) or len(received) < 11:
@@ -70,9 +71,9 @@ def statuses(received: bytes) -> list[Status]:
 
 
 def fast_parts(received: bytes, sizes: list[int], answering: int) -> list[Status]:
-    """The parts of a fast read's answer, which is not stuffed.
+    """Split the answer to a fast read, which is not stuffed, into one part per servo.
 
-    sizes: number of data bytes asked from each servo. answering: number of servos whose parts must have arrived.
+    sizes: number of data bytes requested from each servo. answering: number of servos whose parts must have arrived.
     """
     if not answering:
         if received:

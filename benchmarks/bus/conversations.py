@@ -1,12 +1,12 @@
-"""Random conversations with fake servos of every X model, byte by byte, each answer compared with the manual.
+"""Random byte-level conversations with fake servos of every X model; every answer is compared with the manual.
 
     python benchmarks/bus/conversations.py [--conversations N] [--seed S] [--json]
 
-The host is `conversation` with `codec`, the expectation `servo_rules`; neither knows the fake's code. A conversation
-has one to four servos with random models, IDs, firmware, Return Delay Time and Status Return Level, and some dozen
-random instructions: single, broadcast and group ones, registered writes, resets, Clear, backups, Secondary IDs, changes
-of ID and baud rate, stuffing, and packets that are damaged, cut short, surrounded by noise or nonsense. In virtual
-time.
+The host is `conversation` with `codec`; the expected answers come from `servo_rules`. None of them uses the fake's
+code. A conversation takes place in virtual time and has one to four servos with random models, IDs, firmware, Return
+Delay Time and Status Return Level. It consists of 10 to 30 random actions of the host: single, broadcast and group
+instructions, registered writes, resets, Clear, backups, Secondary IDs, changes of ID and baud rate, stuffed packets,
+and packets that are damaged, cut short, undefined or preceded by noise.
 """
 
 import argparse
@@ -60,7 +60,7 @@ KINDS: tuple[tuple[int, Callable[[Conversation], None]], ...] = (
 
 
 def converse(seed: int, models: Iterable[str] = (), most: int = 30) -> Conversation:
-    """One conversation of up to `most` instructions, ended by the first difference."""
+    """Hold one conversation of at most `most` instructions; stop at the first difference."""
     talk = Conversation(seed, models)
     weights, kinds = [weight for weight, _ in KINDS], [kind for _, kind in KINDS]
     for _ in range(talk.random.randint(10, most)):
@@ -71,7 +71,7 @@ def converse(seed: int, models: Iterable[str] = (), most: int = 30) -> Conversat
 
 
 def main() -> None:
-    """Converse, and print what differs."""
+    """Hold the conversations and print the differences."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--conversations", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)

@@ -2,8 +2,8 @@
 
     python benchmarks/bus/fake_noise.py [--json] [--packets N] [--seed N]
 
-After every tenth piece of noise, and a pause that ends anything it started, a servo is pinged at whatever ID and baud
-rate the noise may have set.
+Every tenth piece of noise is followed by a pause long enough for a reboot or a long reply to end. A servo is then
+pinged at its current ID and baud rate, which the noise may have changed.
 """
 
 import argparse
@@ -38,7 +38,7 @@ class Still:
 
 
 class NoiseRun:
-    """A bus of two servos under noise; `asked` and `answered` count the pings in between."""
+    """A bus of two servos that receives noise; `asked` counts the pings sent in between, `answered` those answered."""
 
     def __init__(self, seed: int) -> None:
         self.random = Random(seed)

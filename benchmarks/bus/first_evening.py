@@ -1,10 +1,10 @@
-"""docs/first_evening.md typed command by command against a fake arm, behind a pseudo-terminal or in virtual time.
+"""Run the commands of docs/first_evening.md one by one on a fake arm, on a pseudo-terminal or in virtual time.
 
     python -m benchmarks.bus.first_evening --out /tmp/evening
 
-Every command is taken from the page, the questions of `hil init` are answered and the joints moved with `hil hand`; in
-virtual time nobody moves them, which init accepts. It fails if a step fails, shows a traceback, or does not name the
-next command, or if the arm moved for more than twelve minutes.
+Every command is taken from the page. The script answers the questions of `hil init` and moves the joints with
+`hil hand`; in virtual time, the joints are not moved, which `hil init` accepts. The script fails if a command fails,
+shows a traceback, or does not name the next command, or if the arm moves for more than twelve minutes.
 """
 
 import argparse
@@ -60,7 +60,7 @@ def main() -> None:
 
 
 def _edited(folder: Path) -> Callable[[Typed], None]:
-    """Reports each command and, once `hil init` has written the file, edits it as a person would."""
+    """Return a function that reports each command and edits the file once `hil init` has written it."""
 
     def tell(typed: Typed) -> None:
         _tell(typed)
@@ -72,7 +72,7 @@ def _edited(folder: Path) -> Callable[[Typed], None]:
 
 
 def _noted(_: Typed) -> None:
-    """Reports nothing: the figures come at the end."""
+    """Report nothing: with --json, only the final figures are printed."""
 
 
 def _tell(typed: Typed) -> None:

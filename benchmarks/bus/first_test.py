@@ -1,17 +1,18 @@
-"""From nothing to the first green test of a third party's driver: a fresh environment, hil's wheel, four lines.
+"""Time from an empty environment to the first passing test of a third party's driver.
 
     python benchmarks/bus/first_test.py [--from wheel|clone|git] [--json]
 
-The driver is ROBOTIS' own SDK, as a stand-in for a third party's. `pip` uses the package index that it is
-configured for. The test runs twice; after installation, the first run compiles Python's bytecode.
+The script installs hil in a fresh environment and runs a test of a few lines. ROBOTIS' own SDK stands in for the third
+party's driver. `pip` uses the package index that it is configured for. The test runs twice, because the first run after
+installation also compiles Python's bytecode.
 
-lines             of the test, excluding imports of the driver
-install_seconds   a fresh environment with hil and pytest: what the index and the disk allow
-first_seconds     the first run of pytest
-seconds           both together: the wait until the first green test; wheel_seconds: time for building the
-                  wheel, for which a user who downloads it does not wait
-again_seconds     the second run of pytest
-passed            whether the test was green
+lines             number of lines of the test, excluding imports of the driver
+install_seconds   time for creating the environment and installing hil and pytest, limited by index and disk
+first_seconds     time of the first run of pytest
+seconds           sum of both: the wait until the first passing test
+wheel_seconds     time for building the wheel, not included in `seconds`, because users download the wheel
+again_seconds     time of the second run of pytest
+passed            whether the test passed
 """
 
 import argparse
@@ -41,7 +42,7 @@ def timed(*command: str | Path, cwd: Path) -> tuple[float, "subprocess.Completed
 
 
 def source(kind: str, folder: Path) -> tuple[str, float]:
-    """The arguments of `pip install`, and the time for building a wheel [s]."""
+    """The argument of `pip install` that selects hil, and the time for building its wheel [s]."""
     if kind == "clone":
         return str(ROOT), 0.0
     if kind == "git":

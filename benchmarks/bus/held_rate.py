@@ -2,18 +2,19 @@
 
     python benchmarks/bus/held_rate.py [--seconds 20] [--rounds 3] [--fast | --plain] [--json]
 
-The arm is held at rest with torque on, with the work of an experiment's stream: deadlines, read-backs, exchanges with
-slow and status reads, checks, recording. `hil fake --pty` serves the servos in another process and takes as long for
-each byte as the wire. Both processes ask for real-time scheduling, each on a core of its own. But the kernel passes on
-the bytes of a pty in a thread of ordinary priority, and virtual machines stall: run it on a quiet machine only. The
-load is printed. Two loops with the same deadlines and real-time settings, which run after each round, show what
-computer and pty alone miss: one only waits, one writes the bytes of an exchange and reads as many as its reply has,
-against a responder in C that takes as long for each byte as the wire, without driver, checks, slow reads or read-backs.
+The arm is held at rest with torque on while the program does the same work as during an experiment: deadlines,
+read-backs, exchanges with slow reads and status reads, checks, and recording. The servos run in another process,
+`hil fake --pty`, which takes as long for each byte as the wire would. Both processes ask for real-time scheduling, each
+on its own core. However, the kernel forwards the bytes of a pty in a thread of ordinary priority, and virtual machines
+stall, so run this on a quiet machine only. The load is printed. After each round, two loops with the same deadlines and
+real-time settings show how many deadlines the computer and the pty miss on their own. The first loop only waits. The
+second writes the bytes of an exchange and reads the reply from a responder in C, which takes as long for each byte as
+the wire would; it has no driver, checks, slow reads or read-backs.
 
-missed: deadlines that were missed. slow: those directly after an exchange that took longer than the wire needs and
-1 ms, so that what was missed is due to computer or pty. lost: samples in which a reply is missing. late: 99 % and the
-largest of the times from a deadline to the write [ms]. took: median, 99 % and the largest round trip [ms]. work: median
-of the time from a reply to the next wait, i.e. of recording and checks [us].
+missed: number of missed deadlines. slow: number of those that follow an exchange that took more than 1 ms longer than
+the wire needs, so that the computer or the pty caused the miss. lost: number of samples in which a reply is missing.
+late: 99 % quantile and maximum of the time from a deadline to the write [ms]. took: median, 99 % quantile and maximum
+of the round trip [ms]. work: median time from a reply to the next wait, which is spent on recording and checks [us].
 """
 
 import argparse
@@ -74,7 +75,7 @@ def six_servos(folder: Path, baud: str = "1_000_000") -> Path:
 
 
 def held(device: str, config: Config, seconds: float, folder: Path) -> dict[str, Any]:
-    """Hold the arm at rest once; return what was missed, lost and late."""
+    """Hold the arm at rest once; return the figures for missed deadlines, lost replies and lateness."""
     config = config.model_copy(update={"port": config.port.model_copy(update={"url": device})})
     samples, count = round(seconds * RATE), len(config.joints)
     with ServoBus.open(config.bus) as bus, Recorder(folder / "samples.npy", count, samples) as recorder:
@@ -108,7 +109,7 @@ def held(device: str, config: Config, seconds: float, folder: Path) -> dict[str,
 
 
 def _behind_slow_ones(rows: Any, is_missed: Any, slow_s: float) -> int:
-    """Number of deadlines missed in a row directly after an exchange that took longer than `slow_s` [s]."""
+    """Number of missed deadlines whose preceding exchange took longer than `slow_s` [s]."""
     count, is_slow = 0, False
     for took, missed_it in zip(rows["time_after_read"] - rows["time_before_write"], is_missed, strict=True):
         if missed_it:
@@ -119,7 +120,7 @@ def _behind_slow_ones(rows: Any, is_missed: Any, slow_s: float) -> int:
 
 
 def bare(seconds: float, device: str | None, *, fast: bool) -> int:
-    """Return how many deadlines are missed with nothing to do, or with the bytes of an exchange over a terminal."""
+    """Return the number of deadlines missed by a loop that only waits or, given a device, only transfers bytes."""
     ids = bytes(number for number, _ in SERVOS)
     goals = bytes((102, 0, 2, 0)) + b"".join(bytes((number, 0, 0)) for number in ids)
     read = Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ
@@ -145,7 +146,7 @@ def bare(seconds: float, device: str | None, *, fast: bool) -> int:
 
 
 def play(bus: ServoBus, guard: Guard, model: ChainWatch, recorder: Recorder, samples: int, worked: list[float]) -> None:
-    """The work of `hil.experiment.stream` for samples at rest. worked: receives what it takes after each reply [s]."""
+    """Do the work of `hil.experiment.stream` for samples at rest; append the time of each sample's work to `worked`."""
     pace, goal, sent_at = Pace(bus, RATE, guard), [0.0] * len(bus.joints), None
     for _ in range(samples):
         deadline, now, late = pace.wait()

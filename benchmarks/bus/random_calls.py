@@ -1,10 +1,10 @@
-"""dynamixel_sdk calls in random order against the fake, each answer compared with the rules of the manual.
+"""Random calls of dynamixel_sdk on a fake arm; every answer is compared with the rules of the manual.
 
     python -m benchmarks.bus.random_calls --calls 3000 --seed 1
 
-Registers, lengths, values in and out of range, IDs, torque on and off, operating modes, registered and grouped
-instructions, reboots and factory resets, over a pseudo-terminal and the SDK's port; `servo_rules` holds the rules.
-After every write the register is read back; every hundred calls the whole table is.
+The calls vary registers, lengths, values in and out of range, IDs, torque, operating modes, registered and grouped
+instructions, reboots and factory resets. They use the SDK's port on a pseudo-terminal; the rules are in `servo_rules`.
+A register is read back after every write, and the whole table after every hundred calls.
 """
 
 import argparse
@@ -57,7 +57,7 @@ PROTECTED = (12, 98)  # a Secondary ID does not answer, and a Bus Watchdog trips
 
 
 def indirect_data(model: str, firmware: int) -> int:
-    """Address of the first byte of indirect data; 330 servos have it at 208 with firmware 52."""
+    """Address of the first byte of indirect data; it differs for XL330 and XC330 servos with firmware 52."""
     return 208 if model.startswith(("XL330", "XC330")) and firmware == 52 else 224
 
 
@@ -74,8 +74,8 @@ class Client:
         self.late = 0
 
     def ask(self, call: Callable[[], Any]) -> Any:
-        """Make a call; repeat it if no answer arrives in time, since both ends of the terminal run on a busy
-        computer.
+        """Make a call; repeat it if no answer arrives in time, because this computer, which runs both ends of the
+        terminal, may be busy.
         """
         for _ in range(TRIES):
             answer = call()
@@ -221,8 +221,8 @@ class Client:
             self.look(servo_id, rules.rows[waiting[0]])
 
     def _act(self, servo_id: int) -> tuple[int, int]:
-        """Send Action to one servo and read its answer, which the SDK's own call leaves unread, where it would disturb
-        the next one.
+        """Send Action to one servo and read its answer, which the SDK's own call does not; an unread answer would
+        disturb the next call.
         """
         packet = [0] * 10
         packet[4], packet[5], packet[6], packet[7] = servo_id, 3, 0, 5
@@ -312,7 +312,7 @@ class Client:
             self._told(servo_id, row, data, (result, 0), "bulk_read_data")
 
     def _confusing(self, rows: Mapping[int, Row]) -> bool:
-        """Whether dynamixel_sdk 4.1 misreads a Fast Bulk Read, since it finds an ID in any byte of the request."""
+        """Whether dynamixel_sdk 4.1 misreads this Fast Bulk Read, because another byte of the request equals an ID."""
         sent = [byte for servo_id, row in rows.items() for byte in (servo_id, row.address, 0, row.size, 0)]
         return any(sent.index(servo_id) % 5 for servo_id in rows)
 
@@ -372,7 +372,7 @@ def servos() -> FakeArm:
 
 @contextmanager
 def sdk_port() -> Iterator[Any]:
-    """The SDK's own port, open on a pseudo-terminal at which the servos are served."""
+    """The SDK's own port, open on a pseudo-terminal with emulated servos."""
     with PtyServer(servos()) as server:
         thread = Thread(target=server.serve, daemon=True)
         thread.start()
@@ -397,7 +397,7 @@ def call(client: Client, calls: int) -> None:
 
 
 def main() -> None:
-    """Call, compare, and print what differs."""
+    """Make the calls, compare the answers, and print the differences."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--calls", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)

@@ -1,4 +1,4 @@
-"""A pty whose far end is served by responder.c."""
+"""A pty with responder.c at its far end."""
 
 import os
 import shutil
@@ -36,7 +36,7 @@ def responder_binary() -> Iterator[Path]:
 
 @contextmanager
 def served_pty(binary: Path, byte_ns: int, *, real_time: bool = False) -> Iterator[str]:
-    """Name of a pty whose far end is served by the responder.
+    """Open a pty with the responder at its far end; yield its name.
 
     byte_ns: wire time per byte [ns]. real_time: whether to give the responder priority over ordinary programs.
     """

@@ -1,8 +1,8 @@
 """What a servo answers and stores according to ROBOTIS' manual alone: the oracle of `random_calls` and `conversations`.
 
 Written from the e-Manual's control tables and protocol page, without the fake's code, so that a difference between the
-two is settled by the manual. Where the manual is silent or vague, the oracle allows several answers, or forgets what a
-register holds until it is read again.
+two is settled by the manual. Where the manual is silent or vague, the oracle allows several answers, or treats the
+value of a register as unknown until it is read again.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,9 +20,9 @@ EEPROM_END = 64
 class Row:
     """One row of a control table.
 
-    low, high: range of a writable register (signed if low is negative); None for a read-only one. initial: value after
-    a factory reset (EEPROM) or at power-up (RAM); None where the table has none. moves: whether the servo itself
-    changes it. limit: address of the register that limits it.
+    low, high: range of a writable register (signed if low is negative); None if it is read-only. initial: value after a
+    factory reset (EEPROM) or at power-up (RAM); None if the table has none. moves: whether the servo changes the value
+    by itself. limit: address of the register that limits the value.
     """
 
     address: int
@@ -91,8 +91,9 @@ def _table(
 ) -> tuple[Row, ...]:
     """One model's table.
 
-    velocity, current: the factory's Velocity and Current Limit. gains: Velocity I and P, Position D, I and P. volts:
-    lowest possible Voltage Limit, the factory's lower one, and the upper one. threshold: Moving Threshold.
+    velocity, current: factory values of Velocity Limit and Current Limit. gains: Velocity I and P, Position D, I and P.
+    volts: lowest value that a voltage limit may have, and factory values of Min and Max Voltage Limit. threshold:
+    Moving Threshold.
     """
     differ = {24: threshold} | dict(zip((76, 78, 80, 82, 84), gains, strict=True))
     differ |= {SERVO_ID: 1, BAUD: 1}
@@ -146,7 +147,7 @@ TABLES = {
     "XC430-W150": _table(460, None, (1920, 100, 0, 0, 460), volts=_V24, threshold=20),
     "XC430-W240": _table(306, None, (1920, 100, 0, 0, 700), volts=_V24),
 }
-"""Control table of every X model for 5 to 12 V with one motor, by the pages x/<model>."""
+"""Control table of every X model for 5 to 12 V with one motor, according to the manual's pages x/<model>."""
 
 for _name in [name for name in TABLES if name.startswith("XW")]:  # watertight: without an LED
     TABLES[_name] = tuple(row for row in TABLES[_name] if row.address != LED)
@@ -179,7 +180,7 @@ class Rules:
         return bool(self.held.get(TORQUE_ENABLE))
 
     def write(self, address: int, data: bytes) -> set[int]:
-        """Write; return the errors that the servo may answer with, and remember what its registers then hold."""
+        """Record a write; return the errors that the servo may answer with. `held` then contains the new values."""
         row = self.rows.get(address)
         if row is not None and len(data) > row.size:
             return self._write_several(address, data)
@@ -202,7 +203,7 @@ class Rules:
         return {FINE}
 
     def _switch_mode(self, mode: int) -> None:
-        """Switching resets gains to those of the mode, the profile to 0, goals to their limits."""
+        """Change the mode, which resets gains to those of the mode, the profile to 0, and goals to their limits."""
         before = self.held.get(OPERATING_MODE)
         self._forget(FORGOTTEN_WITH_MODE)
         if before is not None and before != mode:  # the manual does not say whether the same mode counts
@@ -210,7 +211,7 @@ class Rules:
             self.held |= {goal: self.held[limit] for goal, limit in ((100, 36), (102, 38)) if limit in self.held}
 
     def _wrong(self, address: int, data: bytes) -> set[int]:
-        """Every reason to refuse a write of one register; the manual does not say which of several is answered."""
+        """All errors that apply to a write to one register; the manual does not say which one the servo returns."""
         row = self.rows.get(address)
         if row is None:
             inside = any(address in other.span and other.low is not None for other in self.rows.values())

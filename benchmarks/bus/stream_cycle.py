@@ -1,15 +1,15 @@
-"""Benchmark of the stream's own cycle against other clients' cycles, at a fixed rate, each on a fake bus of its own.
+"""Benchmark of hil's stream and the cycles of other clients at a fixed rate, each on its own fake bus.
 
     python benchmarks/bus/stream_cycle.py                          tables and ratios, 2 servos
     python benchmarks/bus/stream_cycle.py --config six.toml        another planar arm with [fake]
     python benchmarks/bus/stream_cycle.py --json                   one JSON object on standard output and nothing else
 
-`benchmarks/bus_cycle.py` measures one exchange without a pace. Here `hil.experiment.stream` runs as in an experiment:
-it waits for its deadlines (`Pace`), reads goals back before each sample, exchanges, checks and records. Each fake is
-`hil fake --pty` in a process of its own, with the wire time of 1 Mbaud. The other clients write goals and read states
-once per sample, with the same deadlines and real-time settings. All wait by sleeping, without the spin that precedes a
-deadline in an experiment, so that the CPU time is that of the work. The clients take turns; the ratios are medians over
-the rounds.
+`benchmarks/bus_cycle.py` measures exchanges that follow each other without a pause. Here, `hil.experiment.stream` runs
+as in an experiment: it waits for its deadlines (`Pace`), reads goals back before each sample, exchanges, checks and
+records. Each fake bus is `hil fake --pty` in its own process, with the wire time of 1 Mbaud. The other clients write
+goals and read states once per sample, with the same deadlines and real-time settings. All clients sleep until each
+deadline and do not spin before it as an experiment does, so the CPU time is that of the work alone. The clients take
+turns; the ratios are medians over the rounds.
 
 rustypot is optional (`pip install ".[bench]"`).
 """
@@ -67,8 +67,8 @@ Player = Callable[[int], Round]
 
 @contextmanager
 def fake_pty(config: Path, *, real_time: bool = False) -> Iterator[str]:
-    """Name of a terminal on which `hil fake` serves the arm. real_time: with priority over ordinary programs, and on
-    the first core, if that is permitted.
+    """Run `hil fake` on a pseudo-terminal and yield its name. real_time: give the fake priority over ordinary programs,
+    and the first core, if that is permitted.
     """
     command = [sys.executable, "-m", "hil", "fake", str(config), "--pty", "--quiet"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -83,7 +83,7 @@ def fake_pty(config: Path, *, real_time: bool = False) -> Iterator[str]:
 
 @contextmanager
 def stream(device: str, config: Config) -> Iterator[Player]:
-    """The beginning of an experiment: torque on, then ramp in and first period as far as a round lasts."""
+    """Play the beginning of an experiment: torque on, then the first samples of the ramp and the first period."""
     config = config.model_copy(update={"port": config.port.model_copy(update={"url": device})})
     plan = make_plan(config)
     numbers = count()

@@ -10,13 +10,13 @@ links           length 0.08 to 0.20 m and 0.5 to 2.2 kg/m, both times (stall tor
 Coulomb         0.8 to 3 % of stall torque; 330 series and XL430 up to 7 %; independent for each joint
 Stribeck        rise 0 to 0.6, velocity 0.05 to 0.3 rad/s; viscous 0.3 to 2 % of stall per rad/s; offset up to 15 % of
                 Coulomb; armature 1.2 to 5 g m^2 per N m of stall; current lag 0.3 to 2 ms
-richer friction a third of the arms have one to three of: load 0.02 to 0.08; ripple 0.3 to 2 % (5 to 11 cycles);
-                presliding over 0.5 to 5 mrad
+richer friction a third of the arms have one to three of these effects: load dependence of 0.02 to 0.08; ripple of 0.3
+                to 2 % (5 to 11 cycles); presliding over 0.5 to 5 mrad
 zeros           each off by 1 to 2 degrees in either direction
 torque constant each off by up to 12 %, uniformly distributed
-rest            each joint up to 4 degrees from its rest pose, but no farther than friction would hold it
-imperfect       a third of the arms each: friction that falls by 5 to 20 % as grease warms; encoder noise of 0.2 to 0.6
-                steps; once- and twice-per-turn encoder errors of up to 4 and 2 steps
+rest            each joint starts up to 4 degrees from its rest pose, but only as far as friction can hold it
+imperfect       each in a third of the arms: friction that falls by 5 to 20 % as grease warms; encoder noise of 0.2 to
+                0.6 steps; once- and twice-per-turn encoder errors of up to 4 and 2 steps
 limits          what `hil init` writes: 30 % of stall current or voltage, 10 rad/s, swing of 60 to 120 degrees
 """
 
@@ -102,7 +102,7 @@ class Stance(NamedTuple):
 
 
 def stance(random: np.random.Generator, shares: Mapping[str, float], degrees: tuple[float, float]) -> Stance:
-    """Draw how an arm is mounted, from the `shares` of orientations; a tilted one by `degrees` (lowest, highest)."""
+    """Draw how an arm is mounted. shares: probability of each orientation. degrees: smallest and largest tilt."""
     orientation = str(random.choice(list(shares), p=list(shares.values())))
     tilt = DEGREE * random.uniform(*degrees) if orientation == "tilted" else math.pi / 2 * (orientation == "flat")
     rest = {"flat": 0.0, "upright": math.pi / 2}.get(orientation, -math.pi / 2)
@@ -116,7 +116,7 @@ def joint_answers(
     counts: Sequence[int],
     rest: float,
 ) -> tuple[JointAnswers, ...]:
-    """Return what a person would answer to `hil init`; counts: what each encoder reads at its joint's zero [steps]."""
+    """Return a person's answers to `hil init`. counts: what each encoder reads at its joint's zero [steps]."""
     return tuple(
         JointAnswers(
             ("shoulder", "elbow")[i],
@@ -132,7 +132,7 @@ def joint_answers(
 
 
 def stall_torque(model: ServoModel) -> float:
-    """Stall torque at the middle of the voltages for which it is published [N m]."""
+    """Stall torque at the median of the published voltages [N m]."""
     return sorted(each.torque for each in model.stalls)[len(model.stalls) // 2]
 
 
@@ -231,8 +231,8 @@ def _start(
     drives: list[dict[str, Any]],
     weight: float,
 ) -> list[float]:
-    """Draw the initial pose [rad]: off the rest pose by up to 4 degrees, but at most half as far as friction would
-    hold.
+    """Draw the initial pose [rad]: off the rest pose by up to 4 degrees, but at most half as far as friction can hold
+    the joint.
     """
     start = []
     for i, drive in enumerate(drives):

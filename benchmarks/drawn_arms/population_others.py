@@ -1,22 +1,23 @@
 """Arms from a second, wider distribution than that of population_arms.py: arms that other people might build.
 
-models          any of seven, including the voltage-driven XL430; three in ten pairs mix two models
+models          any of seven, including the voltage-driven XL430; three in ten two-joint arms mix two models
 joints          one (30 %) or two
 orientation     hanging 40 %, tilted by 20 to 70 degrees 20 %, flat 20 %, upright 20 %
-links           the first 0.06 to 0.25 m for an XM430, the second 0.3 to 3 times as long; both times (stall torque)^0.4;
-                0.3 to 1.5 kg/m; half carry a payload of up to the link's mass at their end. Redrawn if gravity at full
-                stretch exceeds 20 % of stall at any joint.
+links           the first 0.06 to 0.25 m for an XM430, the second 0.3 to 3 times as long; both scaled by
+                (stall torque)^0.4; 0.3 to 1.5 kg/m; half carry a payload of up to the link's mass at their end. Redrawn
+                if gravity at full stretch exceeds 20 % of stall at any joint.
 friction        Coulomb 0.5 to 7 % of stall, log-uniform; Stribeck rise 0 to 0.5 at 0.03 to 0.4 rad/s;
                 viscous 0.1 to 4 % of stall per rad/s; offset up to 25 % of Coulomb; armature 0.8 to 6 g m^2 per N m
-richer friction a third each have load 0.02 to 0.1, ripple 0.5 to 2.5 % (3 to 16 cycles), presliding over 0.3 to
-                6 mrad with probability 0.15 each
+richer friction each in one in six arms: load dependence of 0.02 to 0.1; ripple of 0.5 to 2.5 % (3 to 16 cycles);
+                presliding over 0.3 to 6 mrad
 cable           one in six: up to 3 % of stall per radian, rest angle up to 0.5 rad away
 torque          one in six saturates by up to 4 % at the current limit
 backlash        one in ten: 0.3 to 1 mrad
-warming         a quarter: 3 to 25 % within 20 to 200 s
+warming         a quarter of the arms: friction falls by 3 to 25 % within 20 to 200 s
 encoder         noise of up to 0.8 steps (a third), once- and twice-per-turn errors of up to 3 and 1.5 steps (a
                 quarter), independent for each joint
-rest            zeros off by up to 2.5 degrees; friction holds it up to 6 degrees away; servo zeros anywhere in a turn
+rest            zeros off by up to 2.5 degrees; arm up to 6 degrees from its rest pose, held there by friction; servo
+                zeros anywhere in a turn
 experiment      rate 50 to 500 Hz, period 8 to 16 s, limits of 50 to 130 degrees, independent on each side
 """
 
@@ -174,7 +175,7 @@ def _held(
     joint: int,
     weight: float,
 ) -> float:
-    """Draw the initial pose [rad]: off the rest pose by as much as friction holds, at most 6 degrees."""
+    """Draw the initial pose [rad]: off the rest pose by at most 6 degrees, but only as far as friction can hold it."""
     held: float = 0.6 * drive["coulomb"] / max(_moment(links, models, joint) * weight, 1e-9)
     return float(random.uniform(-1, 1)) * min(6 * DEGREE, held)
 

@@ -1,13 +1,13 @@
-"""Recordings of planar arms whose joints are late by different times: values, intervals and verdicts.
+"""Estimates from recordings of planar arms whose joints have different delays: values, intervals and verdicts.
 
     python benchmarks/effects/delays.py [--json] [--arms 10] [--first 0] [--law delay|lag|logged] [--longest 3]
 
 delay: each joint's torque comes late; lag: it passes a first-order filter; logged: the position of joint 2 is logged
 later than that of joint 1.
 
-Each arm has links, friction and a multisine torque drawn at random. Its positions come from equations of motion of this
-script's own, in absolute angles, with steps of 20 us; noise is added, and some are rounded as an encoder does. The file
-is then estimated as any recording, with the default choices.
+Each arm has links, friction and a multisine torque drawn at random. Its positions come from this script's own
+equations of motion in absolute angles, integrated with steps of 20 us. Noise is added, and some recordings are rounded
+to encoder steps. Each file is then estimated like any recording, with the default choices.
 """
 
 import argparse
@@ -69,7 +69,8 @@ class Arm:
 
 
 def drawn_arm(random: np.random.Generator) -> Arm:
-    """Links of 0.12 to 0.3 m; two of three friction laws have a Stribeck rise, one a load-dependent part."""
+    """Draw links of 0.12 to 0.3 m and one of three friction laws: two have a Stribeck rise, one of these also depends
+    on load."""
     m1, m2, elbow = random.uniform((0.1, 0.08, 0.06), (0.35, 0.3, 0.1))
     l1, l2 = random.uniform(0.12, 0.3, 2)
     c1, c2 = random.uniform(0.3, 0.6) * l1, random.uniform(0.35, 0.6) * l2
@@ -82,7 +83,7 @@ def drawn_arm(random: np.random.Generator) -> Arm:
 
 
 def drawn_torque(random: np.random.Generator, arm: Arm, rate: int) -> Array:
-    """Ten sines between 0.15 and 4 Hz for each joint, about as strong as its weight (2, samples) [N m]."""
+    """For each joint, ten sines from 0.15 to 4 Hz, with a peak of about the torque of gravity (2, samples) [N m]."""
     time_s = np.arange(round(SECONDS[rate] * rate)) / rate
     truth = arm.truth()
     found = []
@@ -123,9 +124,9 @@ def _rates(state: Array, torque: Array, links: Array, friction: Array) -> Array:
 
 @compiled
 def _motion(command: Array, interval: float, late: Array, links: Array, friction: Array) -> Array:
-    """Positions at every command (2, samples) [rad], hanging at first; each command is held.
+    """Positions at the times of the commands (2, samples) [rad]. The arm hangs at first; each command is held.
 
-    late (3, 2): delay and lag of each joint's torque, and by how much later its position is logged [s].
+    late (3, 2): delay and lag of each joint's torque, and delay with which its position is logged [s].
     """
     steps = round(interval / STEP_S)
     h, samples = interval / steps, command.shape[1]
@@ -153,7 +154,7 @@ def _motion(command: Array, interval: float, late: Array, links: Array, friction
 
 
 def measure(seed: int, law: str, longest_ms: float) -> dict[str, Any]:
-    """Estimate one drawn arm's recording: verdict, deviations in standard errors, errors, processor time."""
+    """Estimate the recording of one drawn arm: verdict, deviations in standard errors, errors, processor time."""
     random = np.random.default_rng([seed, 77])
     arm = drawn_arm(random)
     rate = int(random.choice(list(SECONDS)))

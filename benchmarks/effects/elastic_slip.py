@@ -1,7 +1,8 @@
 """Presliding friction with a law other than the estimator's: parallel springs, each of which slips at its own load.
 
 Iwan, "On a class of models for the yielding behavior of continuous and composite systems", Journal of Applied Mechanics
-34 (1967) 612. Unlike bristles, it remembers every reversal until a larger one erases it, and is rate-independent.
+34 (1967) 612. Unlike bristles, this law remembers every reversal until a larger one erases it, and does not depend on
+velocity.
 """
 
 from hil.fakes.plants.arm import Drive
@@ -12,7 +13,7 @@ SHARE = 1.0 / len(STIFFNESS)  # slip load of each spring, relative to the load a
 
 
 class SlippingMotor(Motor):
-    """A drive whose dry friction consists of four such springs instead of bristles."""
+    """A drive whose dry friction is modelled by four parallel springs that can slip, instead of by bristles."""
 
     def __init__(self, drive: Drive) -> None:
         super().__init__(drive)

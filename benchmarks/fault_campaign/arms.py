@@ -12,10 +12,10 @@ PERIOD_S = 2.0
 SCHEME = "campaign://"
 
 MIXED = "xl430_and_xl330"
-"""An arm of none of the files: one joint driven by voltage, without the register Goal Current, one by current."""
+"""An arm that is not in any file: one joint is driven by voltage and has no register Goal Current, one by current."""
 
 _MIXED_FROM = ("xl430_two_link", "xl330_two_link")
-"""The files that its joints are taken from, in this order."""
+"""The files from which the joints of `MIXED` are taken, in this order."""
 
 _DONOR = "fake_two_link"
 _DONOR_TORQUE = 0.312  # N m, peak torque of joint 1 in xm430_two_link.toml, an arm like the donor's

@@ -109,7 +109,7 @@ class Attack:
     """One attack, from `start` to `end` [s on the port's clock].
 
     servo: bus ID, None for all. chance: probability of affecting a packet. amount: seconds, bits, ticks or a factor,
-    depending on the kind. field: the register that is forged, "state" for all three.
+    depending on the kind. field: the register that is forged, or "state" for all three.
     """
 
     kind: Kind
@@ -126,8 +126,8 @@ class Attack:
 
 @dataclass(frozen=True)
 class Request:
-    """The group read that is being answered: start address and length of the block, the IDs, and whether it is a fast
-    read.
+    """The group read that the servos are answering: start address and length of the block, IDs, and whether the read is
+    a fast read.
     """
 
     address: int
@@ -137,18 +137,18 @@ class Request:
 
 
 def packets_of(data: bytes) -> list[bytes]:
-    """Split one write into packets; bytes that belong to no packet stay with the one before."""
+    """Split one write into packets; bytes that belong to no packet stay with the packet before them."""
     starts = [at for at in range(len(data)) if data.startswith(HEADER, at)]
     return [data[at:end] for at, end in zip(starts, [*starts[1:], len(data)], strict=True)] or [data]
 
 
 def request_in(data: bytes) -> Request | None:
-    """The group read in these bytes of the host; None if there is none."""
+    """Return the group read that these bytes from the host contain; None if there is none."""
     return request_among(Framer().feed(data))
 
 
 def request_among(packets: Iterable[Packet]) -> Request | None:
-    """The first group read among these packets; None if there is none."""
+    """Return the first group read among these packets; None if there is none."""
     for packet in packets:
         if packet.instruction in (0x82, 0x8A) and len(packet.body) > 4:
             address, length = int.from_bytes(packet.body[:2], "little"), int.from_bytes(packet.body[2:4], "little")
@@ -157,7 +157,7 @@ def request_among(packets: Iterable[Packet]) -> Request | None:
 
 
 def goals_in(packet: Packet) -> dict[int, tuple[int, int]]:
-    """ID to (address, goal) of a Sync Write of a two-byte goal; empty for any other packet."""
+    """(address, goal) by servo ID for a Sync Write of two-byte goals; empty for any other packet."""
     body = packet.body
     if packet.instruction != 0x83 or len(body) < 7 or body[2:4] != b"\x02\x00" or body[0] not in (100, 102):
         return {}
@@ -168,14 +168,14 @@ def goals_in(packet: Packet) -> dict[int, tuple[int, int]]:
 
 
 def without_goal(data: bytes, servo_id: int) -> bytes:
-    """A Sync Write of two-byte goals without this servo's, as if its receiver had missed the packet."""
+    """Remove this servo's goal from a Sync Write of two-byte goals, as if the servo had missed the packet."""
     body = data[8:-2]
     kept = [body[at : at + 3] for at in range(4, len(body) - 2, 3) if body[at] != servo_id]
     return encode(data[4], Instruction(data[7]), body[:4] + b"".join(kept)) if kept else b""
 
 
 def blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
-    """ID to (error byte, register block) of the complete answers to `request` in these bytes."""
+    """(error byte, register block) by servo ID for the complete answers to `request` in these bytes."""
     if request.fast:
         return _fast_blocks_in(data, request)
     found: dict[int, tuple[int, bytes]] = {}
@@ -188,7 +188,7 @@ def blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
 
 
 def _fast_blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
-    """The same for a fast answer, which is never byte-stuffed, as far as its CRCs are correct."""
+    """Do the same for a fast answer, which is never byte-stuffed, up to the first wrong CRC."""
     found: dict[int, tuple[int, bytes]] = {}
     length = 1 + (request.length + 4) * len(request.ids)
     start = data.rfind(HEADER + b"\xfe" + length.to_bytes(2, "little"))  # an answer to another request may be pending
@@ -204,7 +204,7 @@ def _fast_blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes
 
 
 def field_of(block: bytes, request: Request, name: str) -> int | None:
-    """The present register `name` in a block [ticks]; None if the block does not contain it."""
+    """Value of the register Present `name` in a block [ticks]; None if the block does not contain it."""
     address, size = PRESENT[name]
     at = address - request.address
     if at < 0 or at + size > request.length:
@@ -213,7 +213,7 @@ def field_of(block: bytes, request: Request, name: str) -> int | None:
 
 
 def with_field(block: bytes, request: Request, name: str, value: int) -> bytes:
-    """The block with one present register replaced."""
+    """The block with the value of one Present register replaced."""
     address, size = PRESENT[name]
     at = address - request.address
     if at < 0 or at + size > request.length:
@@ -224,7 +224,7 @@ def with_field(block: bytes, request: Request, name: str, value: int) -> bytes:
 
 
 def forged(answers: dict[int, tuple[int, bytes]], request: Request, named: Mapping[int, int] | None = None) -> bytes:
-    """The bytes of answers with forged values; every CRC is correct. named: other IDs to send some of them with."""
+    """Encode answers with forged values and correct CRCs. named: false IDs, by the true IDs that they replace."""
     named = named or {}
     if not request.fast:
         return b"".join(

@@ -58,22 +58,22 @@ _LIMITS_LEFT = frozenset({Kind.KILLED, Kind.LOWERED_LIMIT})
 
 _PACKAGE = "benchmarks.fault_campaign"
 _ARMS = (1, 12)
-"""Arms on which stops are simulated: all are needed only if an overshoot is larger than the first one's."""
+"""Numbers of arms on which stops are simulated: the larger one only if the overshoot exceeds that of the first arm."""
 
 _CHECKED_CYCLES = 8
 """Cycles per mode in the next start's `hil check`, which only has to restore settings here."""
 
 
 class DoesNotRun(Exception):
-    """A configuration cannot be run at this rate even without faults, so it cannot be tested."""
+    """A configuration fails at this rate even without faults, so it cannot be tested."""
 
 
 @dataclass(frozen=True)
 class Outcome:
     """The outcome of one injection.
 
-    not_restored: registers that differ from before, after the next start. unreadable: neither an expected message nor a
-    readable recording.
+    not_restored: registers that still differ from their earlier values after the next start. unreadable: the run left
+    neither an expected message nor a readable recording.
     """
 
     setting: Setting
@@ -240,7 +240,7 @@ def _changed(before: Mapping[int, Mapping[str, int]], port: Middle) -> tuple[str
 
 @cache
 def _allowed_by(path: Path, arms: int) -> NDArray[np.float64]:
-    """Largest overshoot beyond the position limits that the dry run predicts of so many arms (joints,) [rad]."""
+    """Largest overshoot of the position limits that the dry run predicts for this number of arms (joints,) [rad]."""
     text = path.read_text(encoding="utf-8")
     config = parse_config(text, path)
     if config.arm.link_lengths is None:
@@ -263,7 +263,7 @@ _designed, _designed_path = remembered(design_multisine), remembered(design_path
 
 @contextlib.contextmanager
 def _quick() -> Iterator[None]:
-    """Run with cached waves and paths, whose design takes as long as the run, and measure the bus only briefly."""
+    """Save time: cache waves and paths, whose design takes as long as a run, and measure the bus only briefly."""
     with (
         mock.patch.object(plan_module, "design_multisine", _designed),
         mock.patch.object(chain_plan, "design_path", _designed_path),

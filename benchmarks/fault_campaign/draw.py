@@ -15,7 +15,7 @@ TOGETHER_S = 0.3
 """Half of the pairs follow each other within this time [s]."""
 
 OFTEN = 0.25
-"""Share of the faults that occur in the phase that is to be tested often."""
+"""Share of the faults that occur in the phase that needs to be tested often."""
 
 SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
@@ -156,7 +156,7 @@ BESIDE: dict[str, frozenset[str]] = {
     Kind.RAISED_LIMIT: frozenset({SETTING, STRANGER}),
     Kind.ANSWERS_LESS: frozenset({SETTING, STRANGER}),
 }
-"""What a message may say beside the cause of a stop: a change that another program did make, but that stops nothing."""
+"""What a message may mention besides the cause of a stop: a real change by another program that stops nothing."""
 
 _OF_FIELD = {
     "position": _READINGS | {LIMIT, POSE},
@@ -226,7 +226,7 @@ class Drawn:
 
 
 def causes_of(drawn: Drawn) -> frozenset[str]:
-    """Causes that a message may name for these faults."""
+    """Causes that a message may correctly name for these faults."""
     own = [CAUSES[each.kind] for each in drawn.faults]
     for each in drawn.attacks:
         is_forged = each.kind in FORGED - {Kind.SWAP, Kind.WRONG_ID}
@@ -235,7 +235,7 @@ def causes_of(drawn: Drawn) -> frozenset[str]:
 
 
 def true_beside(drawn: Drawn) -> frozenset[str]:
-    """What a message may say of these faults although none of it is the cause of a stop."""
+    """What a message may truthfully mention about these faults although it is not the cause of a stop."""
     return frozenset().union(*(BESIDE.get(kind, ()) for kind in drawn.kinds)) - causes_of(drawn)
 
 

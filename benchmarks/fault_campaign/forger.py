@@ -8,7 +8,7 @@ from random import Random
 from benchmarks.fault_campaign.attack import Attack, Kind, Request, blocks_in, field_of, forged, with_field
 
 _IDS = 3
-"""Wrong IDs are 1 to this: those of the arm, and one that is not on the bus."""
+"""Largest wrong ID; wrong IDs from 1 on include those of the arm and one that is not on the bus."""
 
 
 class Forger:
@@ -96,6 +96,6 @@ class Forger:
 
 
 def _misnamed(answers: Mapping[int, object], attacks: Sequence[Attack]) -> dict[int, int]:
-    """The ID of the next servo, or of one that is not there, for the servos that answer with a wrong ID."""
+    """False IDs by true IDs, for servos that are to answer with a wrong ID: that of another servo, or an unused one."""
     hit = [each for each in answers for attack in attacks if attack.kind == Kind.WRONG_ID and attack.concerns(each)]
     return {each: each % _IDS + 1 for each in hit}

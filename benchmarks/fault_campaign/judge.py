@@ -49,8 +49,8 @@ UNSURE_MS = 20
 """How much earlier than an attack its effect may appear in the record [ms], which is written once the bus is used."""
 
 SHORTEST_WATCHDOG_S = 0.04
-"""Shortest Bus Watchdog that a program can run an arm with [s]: it counts in steps of 20 ms, and one step is less than
-the stall of a busy computer after which an arm can still be lowered.
+"""Shortest practicable timeout of the Bus Watchdog [s]. It counts in steps of 20 ms, and with one step, it would trip
+even during a stall of a busy computer after which the arm can still be lowered.
 """
 
 OBEYED = 0.1
@@ -60,15 +60,15 @@ ASTRAY_RAD, ASTRAY_SHARE = 0.1, 0.35
 """Tolerance for the deviation from the undisturbed motion, absolute and relative to the range of that motion."""
 
 DRIVES_MS = 15
-"""Longest time for which a program may command more than ever in the undisturbed run along a visible motion [ms]."""
+"""Longest time for which a goal along a visible motion may exceed all goals of the undisturbed run [ms]."""
 
 DRIVES_SHARE, DRIVES_TICKS, DRIVES_S = 1.2, 5, 0.01
-"""Ratio to the largest goal of the undisturbed run, and smallest change of a position that counts as a visible motion
-[ticks], within this time [s].
+"""Ratio to the largest goal of the undisturbed run above which a goal is too large; smallest change of position that
+counts as visible motion [ticks], and the time within which it must occur [s].
 """
 
 STIRS_RAD = 0.05
-"""Largest motion of a joint between two readings before torque is on that a program may take for a healthy arm's [rad].
+"""Largest motion between two readings before torque is on that a program may attribute to a healthy arm [rad].
 """
 
 TO_BE_SEEN = (
@@ -76,20 +76,21 @@ TO_BE_SEEN = (
     "is not as fast as told",
     "is not where it would be",
 )
-"""Deviations that no program can detect before they show in the replies it receives: not while a healthy arm might have
-sent them (`fault_campaign.twin`).
+"""Deviations that a program can only detect once the replies that it receives differ from all those that a healthy arm
+might have sent (`fault_campaign.twin`).
 """
 
 _TICKS_PER_RAD = 4096 / (2 * np.pi)
 _TICKS_PER_RAD_S = 60 / (2 * np.pi) / 0.229
 
 Numbers = NDArray[np.float64]
-"""A column of a record: with its type stated, checking the types of arithmetic on it takes a tenth of the time."""
+"""A column of a record. Stating its type makes type checking of arithmetic on it ten times as fast."""
 
 
 @dataclass(frozen=True)
 class Story:
-    """Everything about one run: the servos' record, the bytes, when the program ended, its exit code and its output."""
+    """Everything about one run: the servos' record, the bytes transferred, when the program ended, its exit code and
+    its output."""
 
     record: NDArray[Any]
     traffic: Traffic
@@ -102,12 +103,12 @@ class Story:
 class Verdict:
     """The judgement of one run.
 
-    owed: why the current had to end, "" if there was no reason. late_ms: how long it flowed after that. beyond:
+    owed: why the current had to end, "" if there was no reason. late_ms: how long current flowed after that. beyond:
     overshoot of each joint beyond its limit (joints,) [rad]. named: whether the output names the cause; None if nothing
-    stopped the run. misleading: the output names only wrong causes. unseen: current flowed for longer, but until the
-    bound before its end a healthy arm might have sent the same replies (`fault_campaign.twin`), so it is not unsafe.
-    drives_ms: how long the program drove a joint harder than planned, in the direction in which the positions that it
-    received moved, as a brake must not.
+    stopped the run. misleading: the output names only wrong causes. unseen: the current ended late, but a healthy arm
+    might have sent the same replies (`fault_campaign.twin`) until shortly before, so the run is not unsafe. drives_ms:
+    how long the program drove a joint harder than planned in the direction in which the received positions were moving,
+    which a program that brakes must not do.
     """
 
     owed: str
@@ -149,10 +150,10 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
 
 
 def driving_ms(config: Config, told: "Told", story: Story, undisturbed: Story) -> float:
-    """Longest time for which the program commanded a joint more than ever in the undisturbed run, in the direction in
-    which the positions that it received were moving [ms]; 0 for an arm that a stabiliser may hold with any torque.
+    """Longest time for which a joint's goal exceeded all goals of the undisturbed run and drove the joint in the
+    direction in which the received positions were moving [ms]; 0 for arms with a stabiliser, which may use any torque.
 
-    Goals of a servo without torque, as when settings are restored, drive nothing.
+    Goals of a servo with torque off, e.g. while settings are restored, do not count.
     """
     if config.stabiliser is not None:
         return 0.0
@@ -178,7 +179,7 @@ def driving_ms(config: Config, told: "Told", story: Story, undisturbed: Story) -
 
 
 def _visible_motion(when: NDArray[np.float64], heard: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Change of the received positions within `DRIVES_S` before each moment [rad]; 0 if it is not visible."""
+    """Change of the received positions in the time `DRIVES_S` before each moment [rad]; 0 if it is too small to see."""
     moved = np.zeros(when.size)
     latest = np.searchsorted(heard[:, 0], when, "right") - 1
     for index, last in enumerate(latest):
@@ -195,12 +196,12 @@ def received(config: Config, story: Story) -> Heard:
 
 
 def was_built_so(config: Config, drawn: Drawn, story: Story) -> bool:
-    """Whether the only fault is that the servos, which may be wired either way, swapped their IDs before the program
-    had written to them, both standing at the same angle by their own encoders.
+    """Whether the only fault is that two interchangeable servos swapped their IDs before the program had written to
+    them, while their encoders showed the same angle.
 
-    Whatever it had read by then was the same from both. From then on it deals with a healthy arm that is wired the
-    other way round, and no reply can differ from that arm's, since this is the arm. No simulation is needed, and on an
-    upright arm it would not show this: open-loop, the smallest difference makes such an arm fall.
+    Until the swap, both servos gave the same readings. Afterwards, the arm is a healthy arm whose servos are wired the
+    other way round, so its replies cannot reveal the fault. This needs no simulation; for an upright arm, a simulation
+    could not even show it, because in open loop the smallest difference makes such an arm fall.
     """
     if drawn.kinds != (Kind.IDS_SWAPPED,) or not may_be_wired_otherwise(config):
         return False
@@ -216,10 +217,10 @@ def was_built_so(config: Config, drawn: Drawn, story: Story) -> bool:
 
 
 def addressed(config: Config, record: NDArray[Any], joint: int) -> NDArray[Any]:
-    """The record of the servo that had the joint's ID, in each millisecond; of the joint's own servo if none had it.
+    """For each millisecond, the record of the servo that had the joint's ID, or of the joint's own servo if none did.
 
-    A program addresses IDs, and if two servos swap theirs, each does as it is told. Whether that shows in their replies
-    is another question.
+    A program addresses servos by ID. If two servos swap their IDs, each still obeys the commands to its ID; whether
+    their replies reveal the swap is judged elsewhere.
     """
     has_id = record["id"] == config.joints[joint].id
     servo = np.where(has_id.any(axis=1), has_id.argmax(axis=1), joint)
@@ -227,7 +228,7 @@ def addressed(config: Config, record: NDArray[Any], joint: int) -> NDArray[Any]:
 
 
 def acts_at(attack: Attack, attacks: Sequence[Attack]) -> float:
-    """When an attack acts [s]: in virtual time, one during a stop of the program acts once the program goes on."""
+    """When an attack acts [s]: if the program is suspended at its start, the attack acts once the program resumes."""
     stops = [each for each in attacks if each.kind in (Kind.STALL, Kind.SUSPENDED) and each.start <= attack.start]
     return max([attack.start, *(each.start + each.amount for each in stops)])
 
@@ -235,8 +236,8 @@ def acts_at(attack: Attack, attacks: Sequence[Attack]) -> float:
 def since_again(driven: NDArray[np.float64], since: float, again: list[float]) -> float:
     """When the current had to end [s] if another program switched torque on again, at the times `again`.
 
-    driven: times at which current flowed [s]. A new reason begins where it had ended in time after `since`, had stayed
-    off for `LASTING_MS`, longer than while goals pass through zero, and flows again from that moment on.
+    driven: times at which current flowed [s]. The time limit restarts at such a time if the current had ended in time
+    after `since`, had been off for `LASTING_MS` (longer than while goals pass through zero), and then flows again.
     """
     for when in sorted(again):
         begins = when - 1e-3 * UNSURE_MS
@@ -249,13 +250,13 @@ def since_again(driven: NDArray[np.float64], since: float, again: list[float]) -
 
 
 def _flowed_ms(driven: NDArray[np.float64], since: float) -> float:
-    """Time for which current flowed after a moment [s]. driven: times at which it flowed [s]."""
+    """How long current flowed after the time `since` [ms]. driven: times at which it flowed [s]."""
     flowed = driven[driven >= since]
     return 1e3 * float(flowed[-1] - since) if flowed.size else 0.0
 
 
 def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
-    """Whether the message names the cause among at most three causes, and whether it names only wrong ones."""
+    """Whether the message names a true cause among at most three causes, and whether it names only wrong ones."""
     offered = causes_in(text)
     if set(drawn.kinds) <= HARMLESS:
         return False, True  # regardless of the message: the run should not have stopped
@@ -326,16 +327,16 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
 
 
 def _not_before(what: str, when: float, helpless: Sequence[tuple[float, float]]) -> float:
-    """When the current had to end [s] for a failure at `when`; silence does not count while nobody could end it."""
+    """When the current had to end [s] for a failure at `when`; for silence, not before something could end it."""
     until = [end for since, end in helpless if since <= when < end]
     return max([when, *until]) if what.endswith("was not heard") else when
 
 
 def stopped_unwatched(drawn: Drawn) -> list[tuple[float, float]]:
-    """From when to when the program was stopped although another one had disarmed the watchdogs just before [s].
+    """Return when the program was suspended just after another program had disarmed the watchdogs: (start, end) [s].
 
-    A program that is stopped does nothing, and a disarmed watchdog neither. If the program is stopped before the time
-    within which it has to notice the change has passed, nothing is left that could end the current until it runs again.
+    Neither a suspended program nor a disarmed watchdog can end the current. If the program is suspended before it must
+    have noticed the disarmed watchdogs, nothing can end the current until the program runs again.
     """
     disarmed = [each.start for each in drawn.attacks if each.kind in (Kind.WATCHDOG_OFF, Kind.WATCHDOG_LONG)]
     return [
@@ -347,12 +348,12 @@ def stopped_unwatched(drawn: Drawn) -> list[tuple[float, float]]:
 
 
 def fed_by_another(drawn: Drawn, ended: float) -> tuple[float, float]:
-    """From when to when nobody could stop the servos [s]; (inf, -inf) if never.
+    """Return when nothing could stop the servos: (start, end) [s]; the end precedes the start if this never happened.
 
-    A killed program does nothing more, and any packet on the bus feeds the watchdogs, so while another program sends
-    packets more often than the shortest watchdog waits, nothing is left that could end the current. It must end in
-    time after the last of those packets. Packets that are farther apart are held against the program, since a shorter
-    watchdog would have helped.
+    A killed program does nothing more, and any packet on the bus feeds the watchdogs. While another program sends
+    packets at shorter intervals than the shortest possible watchdog timeout, nothing can end the current, which must
+    then end in time after the last of these packets. Longer intervals are no excuse, since a shorter watchdog timeout
+    would have helped.
     """
     since = min((each.start for each in drawn.attacks if each.kind == Kind.KILLED), default=np.inf)
     fed = [
@@ -393,7 +394,7 @@ def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int
 
 
 class Told:
-    """What the program received and what it sent, decoded from the bytes from the first fault, at `start` [s], on."""
+    """The goals that the program sent, and the replies that it received from shortly before the first fault on."""
 
     def __init__(self, config: Config, traffic: Traffic, start: float) -> None:
         self._joints = config.joints
@@ -506,7 +507,7 @@ def _begins(record: NDArray[Any]) -> int:
 def _astray(
     config: Config, drawn: Drawn, own: NDArray[Any], undisturbed: NDArray[Any], later: int
 ) -> NDArray[np.bool_]:
-    """Whether a joint is away from where it is in the undisturbed run, by millisecond; `own` begins `later` ms late."""
+    """For each millisecond, whether a joint is far from its undisturbed motion; `own` begins after `later` ms."""
     count = min(own.size, undisturbed.size)
     wrong = np.zeros(later + own.size, bool)
     if set(drawn.kinds) & SHIFTED:
@@ -521,9 +522,9 @@ def _astray(
 
 
 def _same_plan(own: NDArray[Any], undisturbed: NDArray[Any]) -> int:
-    """For how many milliseconds a servo was given the goals of the undisturbed run.
+    """Number of milliseconds for which a servo was given the goals of the undisturbed run.
 
-    Later a different plan is run: a disturbed period does not repeat the one before, so one more is needed.
+    After that, the plan may differ: a disturbed period does not repeat the previous one, so another one is added.
     """
     goal: Numbers = undisturbed["goal"]
     mine: Numbers = own["goal"]
@@ -535,7 +536,7 @@ def _same_plan(own: NDArray[Any], undisturbed: NDArray[Any]) -> int:
 
 
 def describe(verdict: Verdict) -> str:
-    """The verdict on one line."""
+    """The verdict as one line of text."""
     said = [f"{verdict.owed or 'nothing owed'}, current for {verdict.late_ms:.0f} ms"]
     said += ["UNSAFE"] * verdict.unsafe + ["a healthy arm might have done the same"] * verdict.unseen
     said += [f"DRIVES a joint for {verdict.drives_ms:.0f} ms"] * (verdict.drives_ms > DRIVES_MS)

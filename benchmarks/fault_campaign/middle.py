@@ -1,6 +1,6 @@
 """The man in the middle: a serial port between program and fake bus that modifies bytes as the attacks demand.
 
-Outside an attack's time bytes pass unchanged, at no cost. During an attack every reply is parsed, modified, and passed
+Outside attacks, bytes pass unchanged, at no cost. During an attack every reply is parsed, modified, and passed
 on when it is due. In either case, everything the host reads and writes is stored with its time.
 """
 
@@ -39,7 +39,7 @@ LOOK_BACK_S = 0.5
 
 @dataclass
 class Traffic:
-    """Bytes that passed the port, in order: (time [s], whether they were read, bytes) of every write and every read.
+    """Bytes that passed through the port, in order: (time [s], whether they were read, bytes) for every write and read.
 
     A read and the write of the next request may take place at the same moment of the virtual clock.
     """
@@ -73,7 +73,7 @@ class Middle(FakeSerial):
         super().__init__(*args, **kwargs)
 
     def attack(self, attacks: Sequence[Attack], seed: int) -> None:
-        """Schedule these attacks; chance is drawn from `seed`."""
+        """Schedule these attacks; their random choices depend on `seed`."""
         self._attacks = attacks
         self._random = Random(seed)
         self._to_come = sorted((each for each in attacks if each.kind in AT_ONCE), key=lambda each: each.start)
@@ -166,7 +166,7 @@ class Middle(FakeSerial):
         return taken
 
     def _take(self, byte: bytes) -> None:
-        """Take a byte from the servos; pass on the packet that it completes, with its changes."""
+        """Take a byte from the servos; if it completes a packet, pass on the packet as changed by the attacks."""
         raw = self._raw
         raw += byte
         if len(raw) >= 7 and raw.startswith(HEADER):
@@ -183,7 +183,7 @@ class Middle(FakeSerial):
             self._queue.append((due, data))
 
     def _give_up_waiting(self) -> None:
-        """Pass on a packet whose rest will not come, as when a servo is silent; held back, it would seem to be late."""
+        """Pass on an incomplete packet whose rest will never arrive; otherwise, it would be taken for a late packet."""
         now = self.clock.now()
         self._queue.append((max(now, self._queue[-1][0]) if self._queue else now, bytes(self._raw)))
         self._raw.clear()
@@ -256,7 +256,7 @@ class Middle(FakeSerial):
         return bytes(changed)
 
     def _collided(self, data: bytes) -> bytes:
-        """Combine with the bytes of another servo that answers at the same time: low if either pulls the line low."""
+        """Combine a reply with another servo's simultaneous reply: a bit is low if either servo pulls the line low."""
         other = encode_status(data[4], 0, self._random.randbytes(max(0, len(data) - 11))) if len(data) > 4 else b""
         return bytes(own & its for own, its in zip(data, other.ljust(len(data), b"\xff"), strict=False))
 
@@ -297,7 +297,7 @@ class Middle(FakeSerial):
                 self._undo += happen(each, self)
 
     def _let_rivals_write(self, now: float) -> None:
-        """Let other masters write at their own times, also between two calls of the program."""
+        """Let other masters write when their writes are due, even between two calls by the program."""
         if not self._again:
             return
         for each in [each for each in self._again if each.kind == Kind.RIVAL and not self.over]:

@@ -11,7 +11,7 @@ from hil.fakes.description import FakeArm
 
 
 class Bench:
-    """The one arm under test, its port, and a callback for the first opening of the port."""
+    """The single arm under test, its port, and a callback for the first time that the port is opened."""
 
     arm: FakeArm | None = None
     port: Middle | None = None
@@ -19,7 +19,7 @@ class Bench:
 
     @classmethod
     def lay(cls, arm: FakeArm, opened: Opened) -> None:
-        """Set another arm, which is switched on when its port is first opened."""
+        """Replace the arm; the new one is switched on when its port is first opened."""
         cls.arm, cls.port, cls.opened = arm, None, staticmethod(opened)
 
 

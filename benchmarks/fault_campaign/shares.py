@@ -13,7 +13,7 @@ def in_this_process(part: Part) -> tuple[list[Outcome], str]:
 
 
 def in_own_process(part: Part) -> tuple[list[Outcome], str]:
-    """Injected signals need a main thread, and a worker's is Dask's."""
+    """Run this share in a new process: injected signals need the main thread, which Dask occupies in its workers."""
     with ProcessPoolExecutor(1) as process:
         return process.submit(_all_of, *part).result()
 

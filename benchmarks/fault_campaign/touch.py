@@ -46,7 +46,7 @@ def prepare(attack: Attack, port: "Middle") -> None:
 
 
 def happen(attack: Attack, port: "Middle") -> list[Undo]:
-    """Execute an attack that happens once; return functions that undo changes not caused by the program."""
+    """Execute an attack that happens once; return functions that undo its changes."""
     match attack.kind:
         case Kind.SIGINT | Kind.SIGTERM | Kind.SIGHUP:
             os.kill(os.getpid(), signal.Signals[attack.kind])
@@ -77,7 +77,7 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
 
 
 def overwrite_goals(attack: Attack, port: "Middle") -> None:
-    """Write another goal, like a second master that follows each of the program's commands with its own."""
+    """Write a different goal, like a second master that sends its own command after each command of the program."""
     for servo in port.bus._servos:
         if attack.concerns(servo.id) and servo.torque_enabled:
             address, goal = _write_goal(attack, servo)
@@ -166,7 +166,7 @@ def _change(servo: EmulatedServo, register: str, value: int, before: int | None 
 
 
 def _reset(servo: EmulatedServo, now: float) -> Undo:
-    """Factory Reset with ID and baud rate, as by a button pressed in another program."""
+    """Factory-reset a servo including its ID and baud rate, as if a user had done so in another program."""
     before = {name: servo.memory.value(name) for name in servo.memory.registers}
     factory_reset(servo.memory, bytes((RESET_ALL,)))
     servo.reboot(now, _SHORT_BOOT_S)
@@ -181,7 +181,7 @@ def _reset(servo: EmulatedServo, now: float) -> Undo:
 
 
 def _shadow(attack: Attack, servos: Sequence[EmulatedServo]) -> list[Undo]:
-    """Let a servo execute the instructions to its neighbour too."""
+    """Make a servo also execute the instructions that are addressed to its neighbour."""
     return [
         _change(servo, "Secondary(Shadow) ID", servos[number - 1].id)
         for number, servo in enumerate(servos)
@@ -190,7 +190,7 @@ def _shadow(attack: Attack, servos: Sequence[EmulatedServo]) -> list[Undo]:
 
 
 def _set_clock(seconds: float) -> Undo:
-    """Set the computer's clock; the monotonic one continues."""
+    """Change the computer's clock; the monotonic clock is not affected."""
     right = time.time
 
     def undo() -> None:
@@ -201,7 +201,7 @@ def _set_clock(seconds: float) -> Undo:
 
 
 def _fill_disk() -> Undo:
-    """Limit the size of files, so that writes fail in this process only, as on a full disk."""
+    """Make writes fail as on a full disk, but only in this process, by limiting the size of files."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (_ROOM_BYTES, hard))
     return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

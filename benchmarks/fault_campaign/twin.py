@@ -1,14 +1,14 @@
 """Whether a fault could have been detected: the search for a healthy arm that would have sent the same replies.
 
 A fault that affects only the motion cannot be detected, by any detector, as long as some healthy arm that the
-configuration allows would have answered the same commands in the same way. Such an arm is sought among physical
-parameters (masses, centres, inertias, friction, torque constants, a tilted base) with the emulator's own simulation, by
-least squares. If one is found, this proves that nothing could be detected. If none is found, that proves nothing, and
-the run counts as one in which the fault was detectable.
+configuration allows would have answered the same commands in the same way. Such an arm is sought by least squares with
+the emulator's own simulation, by varying physical parameters (masses, centres, inertias, friction, torque constants,
+tilt of the base). If such an arm is found, this proves that nothing could be detected. If none is found, that proves
+nothing, and the run counts as one in which the fault was detectable.
 
-A healthy arm may also have servos whose velocities lag, as far as the program accepts that of any servo, and, unless
-the configuration describes the arm, its two servos may have been wired the other way round from the start: a program
-knows a joint only by the ID that answers.
+A healthy arm may also have servos that report their velocities with a lag, up to the lag that the program accepts from
+any servo. Unless the configuration describes the arm, its two servos may also have been wired the other way round from
+the start: a program knows a joint only by the ID that answers.
 """
 
 from collections.abc import Sequence
@@ -35,8 +35,8 @@ LAGS_S = np.linspace(0.0, LAG_S, 7)[1:]
 """Lags of a velocity that are tried [s]."""
 
 LAGGING_S = 0.2
-"""Time within which the RMS difference of velocities must be ordinary if a lag explains them [s]: it explains them at
-all times, or not at all.
+"""Intervals in each of which the RMS difference of velocities must be ordinary if a lag explains the differences [s]; a
+lag explains them at all times or not at all.
 """
 
 _TICKS_PER_RAD = 4096 / (2 * np.pi)
@@ -49,16 +49,16 @@ _TILT_RAD = 0.2
 _EVALUATIONS = 6
 _STEP = 0.01  # of the finite differences
 _COARSE_S = 0.005
-"""Interval of the replies and commands in the search [s]; the arm it finds is then compared with all of them."""
+"""Interval of the replies and commands that the search uses [s]; the arm found is then compared with all of them."""
 
 _COARSE_STEP_S = 2.5e-3
 """Longest step of the simulation in the search [s]."""
 
 _CORRECTIONS = 3
-"""Steps of Newton's method on all replies, with the search's derivatives, that follow it."""
+"""Number of steps of Newton's method after the search; they use all replies, and derivatives from the search."""
 
 _HOPELESS = 6.0
-"""Multiple of the largest difference of angles at which the search's arm is not followed up."""
+"""If the arm found by the search differs by more than this multiple of `SAME_RAD` in angle, the search is given up."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Heard:
     def of(
         cls, config: Config, heard: Sequence[Sequence[tuple[float, ...]]], sent: Sequence[Sequence[tuple[float, int]]]
     ) -> "Heard":
-        """From each joint's replies (time, angle, velocity, ...) and goals (time, ticks)."""
+        """Create from each joint's replies (time, angle, velocity, ...) and goals (time, ticks)."""
         told = [np.array(each, float).reshape(-1, 4) for each in heard]
         goals = [np.array(each, float).reshape(-1, 2) for each in sent]
         time = told[0][:, 0]
@@ -98,16 +98,16 @@ class Heard:
         return self.at(np.flatnonzero(self.time <= end))
 
     def at(self, index: NDArray[np.intp]) -> "Heard":
-        """Only the replies with these indices."""
+        """Return only the replies with these indices."""
         return Heard(self.time[index], self.angle[index], self.velocity[index], self.commanded_at, self.commands)
 
     def every(self, step: float) -> NDArray[np.intp]:
-        """Indices of the first reply in each `step` [s]."""
+        """Indices of the first reply in each interval of `step` [s]."""
         _, first = np.unique(np.floor((self.time - self.time[0]) / step), return_index=True)
         return np.asarray(first, np.intp)
 
     def averaged(self) -> "Heard":
-        """With one command between each two replies: the mean of what was commanded."""
+        """Return a copy with a single command between any two replies: the mean of the actual commands."""
         begun = self.commanded_at < self.time[-1]
         changes = np.concatenate((self.commanded_at[begun], self.time[-1:]))
         sums = np.zeros((changes.size, self.commands.shape[1]))
@@ -118,9 +118,9 @@ class Heard:
 
 
 def has_healthy_twin(config: Config, heard: Heard, end: float) -> bool:
-    """Whether a healthy arm is found that would have sent what was received until `end` [s].
+    """Whether a healthy arm can be found that would have sent everything that was received until `end` [s].
 
-    Voltage-driven servos, whose currents the commands do not determine, count as having none.
+    Always False for voltage-driven servos, because the commands do not determine their currents.
     """
     assert config.fake is not None
     arm = config.fake.arm
@@ -134,14 +134,14 @@ def has_healthy_twin(config: Config, heard: Heard, end: float) -> bool:
 
 
 def may_be_wired_otherwise(config: Config) -> bool:
-    """Whether its servos may be wired the other way round: two of the same model, and no description of the arm."""
+    """Whether two servos might be interchanged: they are of the same model and no link lengths are configured."""
     models = {joint.model for joint in config.joints}
     return len(config.joints) == 2 and len(models) == 1 and config.arm.link_lengths is None
 
 
 def wired_otherwise(config: Config, told: Heard) -> Heard | None:
-    """The same replies and commands, if the two servos are wired the other way round: first those of the arm's first
-    joint. None if that cannot be.
+    """Return the replies and commands reordered for an arm whose two servos are wired the other way round; None if that
+    is impossible.
     """
     assert config.fake is not None
     if not may_be_wired_otherwise(config):
@@ -157,7 +157,7 @@ def wired_otherwise(config: Config, told: Heard) -> Heard | None:
 
 
 def _is_found(config: Config, arm: Arm, told: Heard) -> bool:
-    """Whether an arm is found that would have sent these replies: the true one, or one like it."""
+    """Whether an arm can be found that would have sent these replies: the true arm or a similar one."""
     limits = _limits(len(arm.links), _UNDESCRIBED if config.arm.link_lengths is None else _DESCRIBED)
     if _is_same(_differences(arm, np.zeros(limits.size), told), told):
         return True
@@ -190,13 +190,13 @@ def _is_found(config: Config, arm: Arm, told: Heard) -> bool:
 
 
 def _stick(arm: Arm) -> Arm:
-    """The arm with stiction in place of smooth friction, which would need short steps."""
+    """The arm with stiction instead of smooth friction, because smooth friction would need short steps."""
     drives = tuple(drive.model_copy(update={"coulomb_width": 0.0}) for drive in arm.drives)
     return arm.model_copy(update={"drives": drives})
 
 
 def _differences(arm: Arm, parameters: Array, told: Heard) -> Array:
-    """Differences of angles, then of velocities, relative to ordinary ones (2 n joints,)."""
+    """Differences of angles, then of velocities, divided by ordinary differences (2 n joints,)."""
     angle, velocity = _played(arm, parameters, told)
     return np.concatenate(((angle - told.angle).ravel() / SAME_RAD, (velocity - told.velocity).ravel() / SAME_RAD_S))
 
@@ -215,7 +215,7 @@ def _is_same(different: Array, told: Heard) -> bool:
 
 
 def lagging(velocity: Array, time: Array, lag: float) -> Array:
-    """A velocity (n,) [rad/s] at `time` (n,) [s] as a servo reports it whose first-order filter lags by `lag` [s]."""
+    """Delay a velocity (n,) [rad/s] at `time` (n,) [s] by a servo's first-order filter with time constant `lag` [s]."""
     told = velocity.copy()
     kept = np.exp(-np.diff(time) / lag)
     mean = 0.5 * (velocity[1:] + velocity[:-1])
@@ -225,7 +225,7 @@ def lagging(velocity: Array, time: Array, lag: float) -> Array:
 
 
 def _agrees(different: Array, told: Heard) -> bool:
-    """Whether the RMS of these differences of velocities [rad/s] is ordinary within every `LAGGING_S`."""
+    """Whether the RMS of these velocity differences [rad/s] is ordinary in every interval of `LAGGING_S`."""
     _, place = np.unique(np.floor((told.time - told.time[0]) / LAGGING_S), return_inverse=True)
     squares = np.bincount(place, different**2) / np.bincount(place)
     return bool(np.sqrt(squares).max() <= SAME_RAD_S)
@@ -258,7 +258,7 @@ def _altered(arm: Arm, parameters: Array) -> Arm:
 
 
 def _played(arm: Arm, parameters: Array, told: Heard) -> tuple[Array, Array]:
-    """Angles and velocities (n, joints) of the altered arm under the same commands, at the times of `told`."""
+    """Simulate the altered arm with the commands in `told`; return angles and velocities at its times (n, joints)."""
     plant = make_plant(_altered(arm, parameters))
     begun = float(told.commanded_at[0])
     angle, velocity = np.empty_like(told.angle), np.empty_like(told.velocity)

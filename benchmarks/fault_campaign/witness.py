@@ -80,17 +80,17 @@ class Witness:
 
     @property
     def current(self) -> Sequence[float]:
-        """Motor currents as sensed by the servos: a weak motor still carries its current, and a push carries none."""
+        """Motor currents as sensed by the servos: a weak motor carries its full current; an external push adds none."""
         if not self._disturbed:
             return self._plant.current
         return tuple(current + missing for current, missing in zip(self._plant.current, self._missing, strict=True))
 
     def disturb(self, joint: int, attack: Attack) -> None:
-        """Apply an attack to the joint's motor from its start to its end."""
+        """Apply an attack to the joint's motor for the duration of the attack."""
         self._disturbed.append((joint, attack))
 
     def _driven_by(self, current: Sequence[float], now: float) -> Sequence[float]:
-        """The currents whose effect on the plant equals that of `current` on the disturbed arm."""
+        """Currents that have the same effect on the undisturbed plant as `current` has on the disturbed arm."""
         felt = list(current)
         self._missing = [0.0] * self.joints
         for joint, each in self._disturbed:
@@ -126,7 +126,7 @@ class Witness:
         return felt
 
     def _held_back(self, joint: int) -> float:
-        """Current by which the back-EMF reduces that of a motor driven by voltage [A]; 0 for one driven by current."""
+        """Current lost to back-EMF in a voltage-driven motor [A]; 0 for a current-driven motor."""
         servo = self._servos[joint]
         if servo.operating_mode != PWM_MODE:
             return 0.0
@@ -138,7 +138,7 @@ class Witness:
         self._slipped[joint] = attack.amount * done
 
     def _resists(self, joint: int, attack: Attack) -> float:
-        """Force of an obstacle, a snagged cable, or a changed load, relative to the attack's amount."""
+        """Force of an obstacle, a snagged cable, or a changed load, as a fraction of the attack's amount."""
         angles = self._plant.position
         found = self._found_at.setdefault((joint, attack), angles[joint])
         way = max(-1.0, min(1.0, (angles[joint] - found) / SOFT_RAD))
@@ -187,7 +187,7 @@ class Witness:
 
 
 def _teller(servo: EmulatedServo) -> Callable[[], tuple[bool, bool, int, int]]:
-    """Return a function that tells whether the servo drives its motor, whether torque is on, its goal [ticks] and its
+    """Return a function that returns whether the servo drives its motor, whether torque is on, its goal [ticks] and its
     ID.
     """
     memory = servo.memory
@@ -209,6 +209,6 @@ def _teller(servo: EmulatedServo) -> Callable[[], tuple[bool, bool, int, int]]:
 
 
 def _bytes_of(memory: Memory, name: str) -> slice:
-    """Where the register's bytes are; nowhere if the model does not have it."""
+    """Slice of the register's bytes in the memory; empty if the model does not have the register."""
     register = memory.registers.get(name)
     return slice(0) if register is None else slice(register.address, register.address + register.size)

@@ -2,9 +2,9 @@
 
     python benchmarks/safety/guard.py [--json]
 
-The samples of a run of the fake arm are repeatedly passed to the guard, without bus and recorder. The figure is the
-median over rounds of the mean over a round's samples; the fastest round is printed too, because other programs can only
-add to the time.
+The samples of a run of the fake arm are repeatedly passed to the guard, without bus and recorder. For each round, the
+mean over its samples is taken; the output gives the median of these means, and also the smallest one, because other
+programs can only add to the time.
 """
 
 import argparse

@@ -1,11 +1,11 @@
-"""Harsh but healthy arms: how many are stopped although nothing is wrong with them.
+"""Number of healthy but unusual arms that are stopped although nothing is wrong with them.
 
     python benchmarks/safety/healthy.py [--arms 60] [--first 0] [--show] [--json]
 
 Each arm is a bundled planar configuration at 100 or 400 Hz with ramps of only 0.3 s. Its masses, torque constants and
 friction differ from the description by up to a factor of 2.2, 1.5 and 2.5, and it has play, presliding, cogging and
 cables that no description mentions. Each is recorded twice: with and without `arm.link_lengths`. Limits are wide, so
-only a check that takes a healthy arm for a broken one can stop it.
+only a check that mistakes a healthy arm for a faulty one can stop the run.
 """
 
 import argparse
@@ -68,14 +68,14 @@ def draw(seed: int, setting: Setting, period: float, *, described: bool) -> dict
 
 
 def come_to_rest(fake: dict[str, Any]) -> list[float]:
-    """Where the arm hangs at rest [rad]: cogging and cables may pull it away from its rest pose."""
+    """Pose in which the arm comes to rest [rad]; cogging and cables may hold it away from the nominal rest pose."""
     plant = make_plant(Arm.model_validate(fake))
     plant.advance(RESTS_S, (0.0,) * plant.joints)
     return list(plant.position)
 
 
 def stopped(seed: int, *, described: bool) -> tuple[str, str]:
-    """Record one arm; return its setting, and what was said if it did not end as planned."""
+    """Record one arm; return its setting, and the error message if the run did not end as planned."""
     random = Random(f"setting {seed}")
     setting = Setting(random.choice([name for name in names() if name not in _SKIPPED]), random.choice(RATES))
     try:
@@ -86,12 +86,12 @@ def stopped(seed: int, *, described: bool) -> tuple[str, str]:
 
 
 def draw_again(seed: int, described: bool, setting: Setting, period: float) -> dict[str, Any]:
-    """`draw` in the order of arguments that `prepare` expects."""
+    """Call `draw` with the arguments in the order that `prepare` uses."""
     return draw(seed, setting, period, described=described)
 
 
 def cause(said: str) -> str:
-    """One or two words for a stop."""
+    """Return a few words that identify the cause of a stop."""
     for words in ("position limit", "velocity limit", "any arm consistent", "does not repeat", "against its command"):
         if words in said:
             return words

@@ -2,13 +2,13 @@
 
     python benchmarks/safety/kills.py [--kills N] [--json]
 
-105 ms after each kill, the servos are read over the same terminal: each Bus Watchdog must have tripped and each Goal
+The servos are read over the same terminal 105 ms after each kill: each Bus Watchdog must have tripped and each Goal
 Current must be 0. The 5 ms allow for this computer's scheduling; an earlier read would restart the watchdog.
 
-Each kill uses a new arm that hangs at rest, because friction may hold an arm that was killed in motion so far from
-its rest pose that the next experiment refuses to start. A kill does not count if the experiment had already ended by
-itself (a busy computer missed its deadlines) or if the servos answered later than 120 ms after it. It is then
-repeated, and the campaign fails if that happens too often. The fake arm gets real-time priority if permitted: real
+Each kill uses a new arm that hangs at rest, because after a kill in motion, friction may hold an arm so far from its
+rest pose that the next experiment refuses to start. A kill does not count if the experiment had already ended by itself
+(because a busy computer missed its deadlines) or if the servos answered later than 120 ms after the kill. Such a kill
+is repeated; the campaign fails if there are too many of them. The fake arm gets real-time priority if permitted: real
 servos do not wait for this computer's other programs.
 """
 

@@ -193,9 +193,9 @@ def _is_equivalent(line: str, what: str) -> bool:
 
 
 def _passes(module: str, source: str, cache: str) -> bool:
-    """Whether the module's tests pass with this source, in a forked child that already has the libraries loaded.
+    """Return whether the module's tests pass with this source; they run in a forked child with all libraries loaded.
 
-    cache: folder of compiled code, reused for modules that are not compiled themselves, since compiling takes longest.
+    cache: folder of compiled code that is reused unless the module itself is compiled; compiling takes longest.
     """
     sys.stdout.flush()
     child = os.fork()

@@ -1,1 +1,1 @@
-"""The paper that this project started from, on its own arm."""
+"""The method of the paper from which this project started, applied to the paper's own arm."""

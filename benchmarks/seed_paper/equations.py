@@ -60,7 +60,7 @@ class PaperArm:
 
 @dataclass(frozen=True)
 class Excitation:
-    """Torque as a sum of cosines: harmonics and amplitudes per joint."""
+    """Torque as a sum of cosines (spectral lines): harmonics, and amplitudes for each joint."""
 
     lines: npt.NDArray[np.int64]
     """Harmonics of FUNDAMENTAL (lines,)."""
@@ -74,11 +74,11 @@ class Excitation:
 
 
 def own_lines() -> Excitation:
-    """Return the lines of Table 2 for joint 1, and the same amplitudes one harmonic higher for joint 2.
+    """Return the spectral lines of Table 2 for joint 1, and the same amplitudes one harmonic higher for joint 2.
 
-    As printed in equation (19), both joints have the same torque on the same lines, so only sums of the two columns of
-    the transfer function can be observed and A1 of equation (33) is singular. A shift by one harmonic is the smallest
-    change that resolves this.
+    In equation (19) as printed, both joints have the same torque at the same frequencies. Only sums of the two columns
+    of the transfer function can then be observed, and A1 of equation (33) is singular. A shift by one harmonic is the
+    smallest change that resolves this.
     """
     lines, amplitude = np.array(LINES), np.array(AMPLITUDES)
     nothing = np.zeros_like(amplitude)
@@ -87,12 +87,12 @@ def own_lines() -> Excitation:
 
 
 def printed_lines() -> Excitation:
-    """Return the lines of Table 2 as printed, the same for both joints."""
+    """Return the spectral lines of Table 2 as printed, which are the same for both joints."""
     return Excitation(np.array(LINES), np.array([AMPLITUDES, AMPLITUDES]))
 
 
 def response(arm: PaperArm, excitation: Excitation, order: Order) -> Complex:
-    """Return the complex amplitudes of the joint angles on the lines (2, lines) [rad], equation (30)."""
+    """Return the complex amplitudes of the joint angles at the excited harmonics (2, lines) [rad], equation (30)."""
     s = 1j * excitation.frequency
     D, K, F = arm.mass_matrix(), arm.stiffness(), np.eye(2) * arm.viscous
     terms = (s * D[:, :, None] if order == 1 else s * s * D[:, :, None] + s * F[:, :, None]) + K[:, :, None]
@@ -109,9 +109,9 @@ def record(arm: PaperArm, excitation: Excitation, order: Order, rate: float, see
 
 
 def coefficients(position: Array, excitation: Excitation) -> Complex:
-    """Return the complex Fourier coefficients on the lines (2, lines) of one period (2, samples).
+    """Return the complex Fourier coefficients of one period (2, samples) at the excited harmonics (2, lines).
 
-    See equations (48) and (60). The mean of the noise, NOISE / 2, only affects line 0, which is not used. Raises
+    See equations (48) and (60). The mean of the noise, NOISE / 2, only affects harmonic 0, which is not used. Raises
     ShapeError.
     """
     if position.ndim != 2 or position.shape[0] != 2 or position.shape[1] <= 2 * excitation.lines.max():
@@ -128,13 +128,13 @@ def fit_as_printed(coefficient: Complex, excitation: Excitation, known: PaperArm
     """Return m1 and m2 [kg] by the paper's method: ordinary least squares, then the masses from the coefficients.
 
     Joint i's coefficients obey (s^2 + a1 s + a0) q_i = (b11 s + b10) u1 + (b21 s + b20) u2 for the first-order plant.
-    Equations (52) to (58) solve this for joint 1 and (63) to (69) for joint 2, line by line, separately for real and
-    imaginary parts, with the noisy q_i on both sides. Then m1 is found from joint 1's six coefficients and m2 from
+    Equations (52) to (58) solve this for joint 1 and (63) to (69) for joint 2, for each harmonic, separately for real
+    and imaginary parts, with the noisy q_i on both sides. Then m1 is found from joint 1's six coefficients and m2 from
     joint 2's, as the masses that minimise the coefficients' relative error.
 
     `known` provides lengths and inertias; its masses only set the scale. Noise in the regressors biases the
-    coefficients towards zero, however much data there is. Raises ModelError if both joints use the same lines, since
-    the columns of equation (33) then coincide.
+    coefficients towards zero, however much data there is. Raises ModelError if both joints use the same harmonics,
+    since the columns of equation (33) then coincide.
     """
     s = 1j * excitation.frequency
     u1, u2 = excitation.torque
@@ -169,9 +169,9 @@ class MassEstimate:
 def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm, order: Order) -> MassEstimate:
     """Return the masses (and the friction of the second-order plant) that maximise the likelihood of the coefficients.
 
-    The noise of a Fourier coefficient is normal with the same variance on all lines, whatever its distribution in time,
-    so maximising the likelihood means minimising the sum of squared differences between measured and predicted
-    coefficients. `known` provides lengths, inertias and the initial guess.
+    The noise of a Fourier coefficient is normal with the same variance at all harmonics, whatever the noise's
+    distribution in time, so maximising the likelihood means minimising the sum of squared differences between measured
+    and predicted coefficients. `known` provides lengths, inertias and the initial guess.
     """
 
     def arm(x: Array) -> PaperArm:

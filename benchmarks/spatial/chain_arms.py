@@ -1,11 +1,11 @@
-"""`hil identify` on the bundled spatial arms, from URDF, limits and rest pose alone, including the pilot.
+"""`hil identify`, including the pilot, on the bundled spatial arms, given only URDF, limits and rest pose.
 
     python benchmarks/spatial/chain_arms.py [--arm koch] [--json]
 
-For each: trust, residual in encoder steps, held-out error, torque error and coverage of the 95 % intervals (see
-chain_population.py; both in units of joint 1's torque), arm time and processor time, least clearance and largest
-overshoot of a position limit over all recordings, and the ratio of the worst relative standard error of the designed
-path to that of random paths.
+Figures for each arm: trust, residual in encoder steps, held-out error, torque error and coverage of the 95 % intervals
+(see chain_population.py; both in units of joint 1's torque), arm time, processor time, and least clearance and largest
+overshoot of a position limit over all recordings. The last figure is the worst relative standard error of the designed
+path, divided by that of random paths.
 """
 
 import argparse
@@ -31,7 +31,7 @@ PLAIN = 5
 
 
 def over_plain(config: Config) -> float:
-    """Ratio of the designed path's worst relative standard error to the median of random ones, same limits and time."""
+    """Worst relative standard error of the designed path, divided by the median for random paths with equal limits."""
     config = chain_config(config)
     paths = Paths.of(config, ChainBelief.prior(config).torque)
     return float(
@@ -41,7 +41,7 @@ def over_plain(config: Config) -> float:
 
 
 def identified(name: str) -> dict[str, Any]:
-    """One arm."""
+    """Identify one bundled arm; return its figures."""
     config = load_config(Path(name))
     before = resource.getrusage(resource.RUSAGE_SELF)
     with tempfile.TemporaryDirectory() as folder:

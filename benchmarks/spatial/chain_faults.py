@@ -2,25 +2,26 @@
 
     python benchmarks/spatial/chain_faults.py [--injections 100] [--first 0] [--only NAME] [--rate 400] [--show]
 
-The faults are those of benchmarks/faults.py, injected into the whole command on the fake arms
+The faults are those of benchmarks/faults.py, injected while the complete command runs on the fake arms
 `fake_open_manipulator_x` and `fake_viperx_300`, with paths of a few seconds. A spatial arm falls when torque is cut, so
-"current must end within 100 ms" holds only where the servos cannot be commanded any more. The emulated servos' own
-record, which the program never sees, decides:
+the rule "current must end within 100 ms" applies only if the servos can no longer be commanded. Runs are judged by the
+emulated servos' own record, which the program never sees:
 
 can command     the faults are of kinds that leave commands and readings intact (`COMMANDABLE`), the record shows no
                 servo that was silent, disobeyed or reported something false, and nothing held the arm by force
-unsafe          judged by what the program can do: servos that obey may be driven until the arm is lowered, since
-                nothing else lowers it; a motor whose current the program does not control must be off within 100 ms;
-                one that hears nothing can only be stopped by its watchdog. So: a motor that carried a current that was
-                not commanded for more than 100 ms (the watchdog's time where a servo hears nothing), also while the
-                arm was lowered; current for longer than that after a servo was silent or the cable unplugged; after
-                any other reason, current for longer than the lowering takes. Links that, while motors drove them, came
-                closer to each other than in the undisturbed run, and touched; an arm that lies touches what it lies on,
-                also if a joint that something holds by force is all that is away from the rest pose, since nothing
-                could bring that joint home. A joint that overshot its limits further than a lowering may. After a kill
-                while another program feeds the watchdogs, nobody can end the current (`judge.fed_by_another`)
-lying           of the runs that were stopped although they could command: the arm ended in its rest pose, and
-                current was only switched off there
+unsafe          at least one of these happened:
+                - A motor carried a current that was not commanded for more than 100 ms, even while the arm was being
+                  lowered. If a servo receives nothing, only its watchdog can stop it, so the limit is the watchdog's.
+                - Current flowed for longer than this limit after a servo fell silent or the cable was unplugged. After
+                  any other failure, servos may be driven for as long as lowering the arm takes.
+                - While motors drove the arm, links touched that had not been as close in the undisturbed run. Contacts
+                  in the rest pose do not count; a joint held by force is taken to be in its rest pose, since nothing
+                  could have brought it there.
+                - A joint overshot its limits by more than lowering the arm may cause.
+                Nothing can end the current after a kill while another program feeds the watchdogs, so this time does
+                not count (`judge.fed_by_another`).
+lying           of the runs stopped while the arm could still be commanded, the number in which current was only
+                switched off in the rest pose
 """
 
 import argparse
@@ -65,7 +66,7 @@ PERIOD_S = 2.0
 RAMP_S = 1.5
 SWING = 0.4
 SAME_M = 2e-3
-"""Difference of two runs' least clearance that does not count [m]: an arm that lies touches what it lies on."""
+"""Tolerated difference between two runs' least clearances [m]: at rest, an arm touches what it rests on."""
 
 INJECTIONS = 100
 
@@ -89,7 +90,7 @@ COMMANDABLE = _BY_FORCE | {
 """Kinds after which every servo still receives, obeys and reports true values."""
 
 WEAKER = 0.3
-"""Force relative to the largest motor torque of the run that a motor overcomes on the path home in any pose."""
+"""Force that a motor can overcome in any pose on the path home, relative to the largest motor torque of the run."""
 
 SETTLES_S = 1.0
 """Time beyond the predicted lowering that a stop may take [s]."""
@@ -102,11 +103,11 @@ LOOKED_AT_MS = 5
 class ChainOutcome:
     """The outcome of one injection.
 
-    owed: why the run had to end, "" if there was no reason. can_command: see above; None if nothing stopped the run.
-    lies: whether it ended lying in its rest pose. late_ms: how long current flowed after the reason. clearance: least
-    distance while motors drove the arm, beyond that of the undisturbed run if that is negative [m]. beyond: largest
-    overshoot beyond a position limit meanwhile [rad]. overruled_ms: longest time for which a motor carried a current
-    that was not commanded, of `cut_ms` allowed.
+    owed: why the run had to end, "" if there was no reason. can_command: see above. lies: whether the arm was in its
+    rest pose when current ended. late_ms: how long current flowed after the failure. clearance: least distance while
+    motors drove the arm, minus that of the undisturbed run if the latter is negative [m]. beyond: largest overshoot of
+    a position limit while motors drove the arm [rad]. overruled_ms: longest time for which a motor carried a current
+    that was not commanded; at most `cut_ms` is allowed.
     """
 
     setting: Setting
@@ -149,7 +150,7 @@ class ChainOutcome:
 
 
 def make_document(setting: Setting, period: float) -> dict[str, Any]:
-    """The bundled configuration with a short path at this rate, behind the campaign's port."""
+    """The bundled configuration with a short path at this rate, connected through the campaign's port."""
     document: dict[str, Any] = tomllib.loads((arms.CONFIGS / f"{setting.name}.toml").read_text(encoding="utf-8"))
     urdf = str(arms.CONFIGS / document["arm"]["urdf"])
     document["arm"]["urdf"] = document["fake"]["chain"]["urdf"] = urdf
@@ -220,14 +221,14 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
 
 
 def _owed(reasons: list[Reason], unreached: list[Reason], cut_ms: float, lower_ms: float) -> tuple[Reason, float]:
-    """The reason whose bound ends first, and the bound [ms]."""
+    """The reason whose time limit expires first, and this limit [ms]."""
     ends = [(each, cut_ms if each in unreached else lower_ms) for each in reasons]
     return min(ends, key=lambda pair: pair[0][1] + 1e-3 * pair[1], default=(("", np.inf), cut_ms))
 
 
 @cache
 def longest_lowering(path: Path) -> float:
-    """Longest path home [s] from any point of the planned path."""
+    """Duration of the longest path home from any point of the planned path [s]."""
     from hil.config.schema import parse_config
     from hil.plan.chain_plan import make_chain_plan
 
@@ -242,9 +243,10 @@ def longest_lowering(path: Path) -> float:
 
 
 def _leaves_command(drawn: Drawn, ended: float) -> bool:
-    """Whether all faults are of kinds after which the arm can still be commanded, and no force held it at the end.
+    """Whether the arm could still be commanded: all faults are of kinds that permit this, and no force held it.
 
-    A second request to stop asks for torque to be cut at once, so it does not.
+    Only a force that still acts at the end of the run counts. False after a second request to stop, which asks for
+    torque to be cut at once.
     """
     forced = any(
         each.kind in _BY_FORCE and each.start < ended < each.end and abs(each.amount) > WEAKER for each in drawn.attacks
@@ -272,7 +274,7 @@ def _undisturbed_clearance(setting: Setting) -> float:
 
 
 def _without_held(config: Config, position: Array, time: Array, drawn: Drawn | None) -> Array:
-    """The poses (joints, times) [rad], with joints that something holds by force at their rest angles meanwhile."""
+    """The poses (joints, times) [rad], but with joints at their rest angles while something holds them by force."""
     free = position.copy()
     for attack in drawn.attacks if drawn else ():
         if attack.kind in _BY_FORCE and abs(attack.amount) > WEAKER:

@@ -2,16 +2,16 @@
 
     python benchmarks/spatial/chain_population.py --arms 60 [--first 0] [--plain] [--json]
 
-Axes, lengths, masses, servos, rest pose and limits are drawn; the real arm's masses differ from the URDF's by 30 %,
-its centres of mass by 5 mm, its torque constants by 3 %. Unless `--plain` is given, the files also vary in style like
-those of other authors: axes in any direction, turned joint frames, meshes and boxes as collision geometry, fixed tool
-frames, a gripper of two prismatic fingers of which one mimics the other, a tilted base, and `friction = "auto"`.
+Axes, lengths, masses, servos, rest pose and limits are drawn at random; the real arm's masses differ from the URDF's by
+30 %, its centres of mass by 5 mm, its torque constants by 3 %. Unless `--plain` is given, the files also vary in style
+like those of other authors: axes in any direction, turned joint frames, meshes and boxes as collision geometry, fixed
+tool frames, a gripper with two prismatic fingers, one mimicking the other, a tilted base, and `friction = "auto"`.
 
-Counted: runs that finish with a result, collisions of the recorded motion with the arm itself or the floor, exceeded
-position limits, and results that say "yes" although they are wrong: the rigid-body torque on random motions is off by
-more than 2 % and three standard errors for some joint, or more than a tenth of the parameters are off by more than four
-standard errors. True values are in units of the first joint's torque constant, as results are. A run that is refused by
-its dry run as unsafe has not finished.
+The script counts runs that finish with a result, collisions of the recorded motion with the arm itself or the floor,
+exceeded position limits, and results that say "yes" although they are wrong: the rigid-body torque on random motions is
+off by more than 2 % and three standard errors for some joint, or more than a tenth of the parameters are off by more
+than four standard errors. Like the results, true values are in units of the first joint's torque constant. A run that
+the dry run refuses as unsafe does not count as finished.
 """
 
 import argparse
@@ -49,7 +49,7 @@ SERVOS = (("XM430-W350", 1.8, 1.4), ("XM540-W270", 2.41, 3.5))
 
 @dataclass(frozen=True)
 class Style:
-    """How a file looks. turned: axes in any direction and turned frames; shape of collision geometry; gripper; base."""
+    """How a file is written. turned: axes in any direction and turned frames. shape: type of collision geometry."""
 
     turned: bool = False
     shape: str = "cylinder"
@@ -189,7 +189,7 @@ def toml_of(
 
 
 def draw(folder: Path, seed: int, plain: bool = False) -> Path:
-    """Draw an arm with a rest pose in which it is clear of everything; return its file."""
+    """Draw an arm and a rest pose in which the arm touches neither itself nor the floor; return its file."""
     random = np.random.default_rng((17, seed))
     style = Style() if plain else Style.draw(np.random.default_rng((18, seed)))
     joints = int(random.integers(3, 7))
@@ -225,7 +225,7 @@ def draw(folder: Path, seed: int, plain: bool = False) -> Path:
 
 
 def _weights(known: KnownChain, rest: Any, random: np.random.Generator) -> tuple[Any, Any]:
-    """Torque that holds the described arm in its rest pose, and the largest over random poses (joints,) [N m]."""
+    """Torques that hold the described arm in its rest pose, and their maxima over random poses (joints,) [N m]."""
     n = len(rest)
     arm = ChainArms(known.base, known.base.of_all(known.described)[None], np.zeros((1, 6, n)))
     poses = random.uniform(-2.5, 2.5, (60, n))

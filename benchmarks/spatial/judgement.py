@@ -17,9 +17,9 @@ WRONG_TORQUE, WRONG_STDS, WRONG_SHARE = 2.0, 3.0, 0.1  # percent of the torque; 
 
 
 def joint_1_unit(config: Config, found: hil.Identification) -> float:
-    """Ratio of joint 1's true torque per goal to the configured one, in which torques of a result are measured.
+    """Ratio of joint 1's true torque per goal to the configured value, which is the torque unit of a result.
 
-    1 if torque scales were not estimated: then every joint's own constant was trusted.
+    1 if torque scales were not estimated, since every joint's configured constant was then trusted.
     """
     assert config.fake is not None and config.fake.chain is not None
     if "torque_scale_2" not in found.extra:
@@ -38,7 +38,7 @@ def true_values(config: Config, found: hil.Identification) -> dict[str, float]:
 
 
 def judged(config: Config, found: hil.Identification) -> dict[str, float]:
-    """Compare a result with the truth: worst joint's torque error on random motions, share of wrong error bars."""
+    """Compare a result with the truth: worst joint's torque error on random motions, coverage of error bars."""
     known, n = known_chain(config), len(config.joints)
     random = np.random.default_rng(5)
     q, v, a = (size * random.standard_normal((n, 300)) for size in (1.0, 1.5, 4.0))

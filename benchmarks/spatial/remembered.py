@@ -10,9 +10,10 @@ Result = TypeVar("Result")
 
 
 def remembered(function: Callable[Given, Result]) -> Callable[Given, Result]:
-    """Return `function`, which must be pure, with a memory; arguments and results may be anything that can be pickled.
+    """Return a version of `function` that remembers its results; `function` must be pure.
 
-    Unlike `functools.cache` it accepts arrays, and each caller gets a copy of its own.
+    Arguments and results may be anything that can be pickled. Unlike `functools.cache`, this accepts arrays, and each
+    caller gets its own copy of the result.
     """
     results: dict[bytes, bytes] = {}
 

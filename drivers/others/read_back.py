@@ -184,7 +184,7 @@ class ReadBack:
         self.longest = max(_FADES * self.longest, seconds)
 
     def postponed(self, now: float) -> None:
-        """Note that a cycle leaves no time for a read-back."""
+        """Record the fact that a cycle left no time for a read-back."""
         self.overdue_at = min(self.overdue_at, now + OVERDUE_S)
 
     def delayed(self, now: float, delay: float, *, alone: bool) -> None:
@@ -200,7 +200,7 @@ class ReadBack:
         self.overdue_at = min(due, now + pause)
 
     def may_repeat(self, now: float, takes: float) -> bool:
-        """Return whether a lost read-back is to be repeated at once, which takes `takes` [s]."""
+        """Return whether to repeat a lost read-back at once. takes: duration of the repetition [s]."""
         if takes >= self._longest_again or now <= self._repeated_at + TRY_AGAIN_S:
             return False
         self._repeated_at = now

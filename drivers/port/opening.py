@@ -25,8 +25,8 @@ _BAUD_TOLERANCE = 0.03
 
 
 def open_serial(url: str, baud: int) -> Any:
-    """Open a device or URL as pyserial does, but refuse a device that another program has open or that runs at another
-    baud rate. Raises PortNotOpened.
+    """Open a device or URL as pyserial does, but refuse a device that another program has open or that does not run at
+    the requested baud rate. Raises PortNotOpened.
     """
     try:
         # exclusive: a second program on the same bus would steal replies and send its own goals.
@@ -58,7 +58,7 @@ def _claim(url: str, opened: serial.Serial) -> None:
 
 
 def check_baud(url: str, opened: serial.Serial, baud: int) -> None:
-    """Raise PortNotOpened if the adapter runs at another baud rate."""
+    """Raise PortNotOpened if the adapter does not run at the requested baud rate."""
     actual = true_baud(opened.fileno())
     if actual is not None and abs(actual - baud) > _BAUD_TOLERANCE * baud:
         raise PortNotOpened(

@@ -17,7 +17,7 @@ transmitted with this many bits per byte. The true number is ten.
 """
 
 GROWTH = 3
-"""Value of `Port.growth` while torque is off: an adapter may delay replies for longer than the first attempts wait."""
+"""Value of `Port.growth` while torque is off: an adapter may delay a reply beyond the end of the first wait."""
 
 
 class ReplyTime(NamedTuple):
@@ -56,7 +56,7 @@ class Port:
         self.late_replies = 0
         """Number of late replies during set-up work since torque was last switched on."""
         self.growth = GROWTH
-        """Factor by which each further attempt of set-up work waits longer; 1 while servos have torque."""
+        """Factor by which the wait grows with each attempt at a set-up exchange; 1 while servos have torque."""
         self._serial = opened
         self._timeout: float | None = opened.timeout
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()

@@ -124,8 +124,8 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
     back.
 
     Raises WrongSetting if torque is on, and TorqueDoubted if EEPROM is locked although torque reads back as off. Raises
-    the errors of `Servo.write` only after all other registers have been tried; the error then has the registers
-    `in_doubt`, and its message names them.
+    the errors of `Servo.write` only after all other registers have been tried; the error's `in_doubt`
+    and message then name the registers that failed.
     """
     _refuse_torque(servo)
     settings = attainable(servo, settings)
@@ -169,8 +169,8 @@ def _refuse_torque(servo: Servo) -> None:
 
 
 def _doubted(servo: Servo, failures: Mapping[str, DriverError]) -> TorqueDoubted:
-    """Arm the watchdog of a servo that locks its EEPROM, unless it has tripped already, so that the servo stops as
-    soon as the bus is silent; return the error.
+    """Arm the Bus Watchdog of a servo that locks its EEPROM, so that the servo stops once the bus is silent; return the
+    error to raise. A watchdog that has already tripped is left as it is.
     """
     with suppress(DriverError):
         if servo.read_despite_error("Bus Watchdog") != WATCHDOG_TRIPPED:

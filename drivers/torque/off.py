@@ -246,7 +246,7 @@ def _tell(port: Port, servos: Mapping[Joint, Servo], register: str, value: int, 
 def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> frozenset[Joint]:
     """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more.
 
-    Return the joints whose watchdog has or may have tripped, which cannot be read afterwards.
+    Return the joints whose watchdog has tripped or may have tripped; once it is off, this can no longer be read.
     """
     tripped = set(servos)
 

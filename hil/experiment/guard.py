@@ -335,7 +335,7 @@ class Guard:
         if unheard is Unheard.ONE:
             return "Requests or replies are lost: check its cable and its supply."
         # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
-        shared = "No servo was heard; requests or replies are lost: check the adapter, the cables and the supply"
+        shared = "No servo replied; requests or replies are lost: check the adapter, the cables and the supply"
         if self._silence.is_busy:
             return f"{shared}, and whether other programs keep this computer busy, since this program was running late."
         return f"{shared}."

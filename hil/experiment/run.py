@@ -236,7 +236,7 @@ def _why_silent(bus: ServoBus, stop: SafetyStop) -> str:
     if stop.unheard is not Unheard.ALL or not silent or not heard:
         return ""
     return (
-        f"No servo was heard at the stop, but {' and '.join(heard)} answered afterwards and "
+        f"No servo replied when the arm was stopped. Afterwards, {' and '.join(heard)} answered and "
         f"{' and '.join(map(str, silent))} did not: a silent servo hides the replies of those after it. Check its "
         "cable and its supply."
     )

@@ -1,1 +1,1 @@
-"""A host and fake servos that exchange bytes, each answer compared with the manual."""
+"""A host that exchanges bytes with fake servos and compares every answer with the manual."""

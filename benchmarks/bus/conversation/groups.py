@@ -1,4 +1,4 @@
-"""Instructions to several servos, changes of how they answer, and bytes that are no packets."""
+"""Instructions to several servos, changes to how servos answer, and bytes that are not packets."""
 
 from benchmarks.bus import codec
 from benchmarks.bus.codec import BROADCAST, Status, packet
@@ -32,7 +32,7 @@ class Conversation(SingleInstructions):
     # What determines whether and how a servo answers
 
     def level(self) -> None:
-        """Status Return Level; the write itself is answered according to the old or the new one."""
+        """Change Status Return Level; whether the write is answered may depend on the old or the new level."""
         servo, level = self.any_servo(), self.random.choice((0, 1, 2, 2, 2))
         before = servo.level
         raw = packet(servo.id, codec.WRITE, bytes((LEVEL, 0, level)))
@@ -44,7 +44,7 @@ class Conversation(SingleInstructions):
         servo.rules.held[LEVEL] = level
 
     def delay(self) -> None:
-        """Return Delay Time: an answer begins after it, and soon after it."""
+        """Change Return Delay Time, and check that the next answer begins directly after this delay."""
         servo = self.any_servo()
         if servo.rules.torque or servo.level == 0:
             return
@@ -77,7 +77,7 @@ class Conversation(SingleInstructions):
         self.found(servo)
 
     def other_rate(self) -> None:
-        """A new Baud Rate: it answers at the new one only, and comes back."""
+        """Change Baud Rate, check that the servo answers only at the new rate, and change it back."""
         servo, index = self.any_servo(), self.random.choice((0, 1, 2, 4, 5, 6, 7, 8))
         before = servo.rules.held[BAUD]
         may = servo.rules.write(BAUD, bytes((index,)))
@@ -87,7 +87,7 @@ class Conversation(SingleInstructions):
         self._follow(servo)
 
     def secondary(self) -> None:
-        """A Secondary ID obeys writes to RAM, does not answer, and protects the EEPROM (x/shadow_id)."""
+        """At its Secondary ID, a servo obeys writes to RAM, but not to EEPROM, and does not answer (x/shadow_id)."""
         servo = self.any_servo()
         if servo.rules.torque:
             return
@@ -120,7 +120,7 @@ class Conversation(SingleInstructions):
         return listed
 
     def until_silence(self, listed: list[int], *, fast: bool) -> list[Servo]:
-        """Those who answer: a silent one silences the others (ROBOTIS, DynamixelSDK issue 364)."""
+        """Servos that answer: those after a silent servo are silent too (ROBOTIS, DynamixelSDK issue 364)."""
         found = []
         for servo_id in listed:
             servo = self.named(servo_id)
@@ -169,7 +169,7 @@ class Conversation(SingleInstructions):
             self.compare(servo, own, status.data, what)
 
     def group_write(self) -> None:
-        """Nobody answers; each takes or refuses its own."""
+        """Send a group write: no servo answers; each accepts or refuses its own value."""
         bulk, listed = self.random.random() < 0.5, self.ids()
         one = self.row(self.any_servo())
         parts, written = [], []
@@ -192,7 +192,7 @@ class Conversation(SingleInstructions):
             self.settle(servo, [address])
 
     def write_all(self) -> None:
-        """A broadcast Write: nobody answers, all obey."""
+        """Send a broadcast Write: no servo answers; all obey."""
         row = self.row(self.any_servo())
         data = self.value(row)
         self.ask(
@@ -208,10 +208,10 @@ class Conversation(SingleInstructions):
         """A broadcast Read is not answered."""
         self.ask("read_all", packet(BROADCAST, codec.READ, b"\x84\0\4\0"), [])
 
-    # Bytes that look like a header, and packets that are none
+    # Bytes that look like a header, and bytes that are not packets
 
     def stuffing(self) -> None:
-        """Indirect data, plain memory by default, with 0xFF 0xFF 0xFD in it, both ways."""
+        """Write 0xFF 0xFF 0xFD to indirect data, which is plain memory by default, and read it back."""
         servo = self.any_servo()
         size = self.random.randint(3, 20)
         data = bytearray(self.random.randbytes(size))
@@ -238,7 +238,7 @@ class Conversation(SingleInstructions):
         self.settle(servo, [row.address])
 
     def cut_short(self) -> None:
-        """Part of a packet, a pause of more than 1.5 ms, then a whole one, which is answered."""
+        """Send part of a packet, pause for more than 1.5 ms, then send a whole packet, which must be answered."""
         servo = self.any_servo()
         row = self.row(servo)
         raw = packet(servo.id, codec.WRITE, row.address.to_bytes(2, "little") + self.value(row))
@@ -247,7 +247,7 @@ class Conversation(SingleInstructions):
         self.settle(servo, [row.address])
 
     def noise(self) -> None:
-        """Bytes before a packet that are no header."""
+        """Send bytes that are not a header, followed by a packet."""
         servo = self.any_servo()
         clutter = bytes(self.random.choice((0x00, 0x12, 0xFD, 0xFF, 0xFE)) for _ in range(self.random.randint(1, 9)))
         if SPECIAL in clutter + b"\xff\xff"[:1]:
@@ -256,7 +256,7 @@ class Conversation(SingleInstructions):
         self.ask("noise", clutter + packet(servo.id, codec.PING), [(servo, {FINE})])
 
     def nonsense(self) -> None:
-        """Undefined instructions and IDs, and a status on the line."""
+        """Send undefined instructions, undefined IDs, and a status packet."""
         servo = self.any_servo()
         undefined = self.random.choice((0x00, 0x07, 0x0F, 0x21, 0x77, 0x99))
         self.ask(f"undefined {undefined:#x}", packet(servo.id, undefined), self.answers(servo, {INSTRUCTION}))

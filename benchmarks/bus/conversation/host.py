@@ -1,4 +1,4 @@
-"""The host: the wire, and the comparison of every answer with what the manual allows."""
+"""The host: it uses the wire and compares every answer with what the manual allows."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -64,7 +64,7 @@ class Host:
     # The wire
 
     def send(self, raw: bytes, wait: float = QUIET_S) -> bytes:
-        """Send bytes; return everything that arrives until the line has been quiet."""
+        """Send bytes; return everything that arrives before the line falls silent."""
         self.bus.write(raw)
         return self.bus.read(10_000, wait + 10 * len(raw) / self.bus.baud)
 
@@ -75,9 +75,9 @@ class Host:
         self.differences.append(f"{what}: {got}")
 
     def ask(self, what: str, raw: bytes, wanted: list[tuple[Servo, set[int]]], ids: Iterable[int] = ()) -> list[Status]:
-        """Send a packet and compare the statuses with those wanted: sender, and the errors that the manual allows.
+        """Send a packet; compare the status packets with `wanted`: the senders, each with its allowed errors.
 
-        ids: other IDs that the senders may give, where the manual does not say which.
+        ids: other IDs with which the senders may answer if the manual does not specify the ID.
         """
         self.kinds[what.split(" ", maxsplit=1)[0]] += 1
         told = "; ".join(f"{servo.model} v{servo.firmware} ID {servo.id}" for servo, _ in wanted) or "nobody"
@@ -116,11 +116,11 @@ class Host:
         return (number % (1 << 8 * row.size)).to_bytes(row.size, "little")
 
     def answers(self, servo: Servo, errors: set[int], least: int = 2) -> list[tuple[Servo, set[int]]]:
-        """The servo's answer to an instruction that its Status Return Level lets it answer from `least` on."""
+        """The expected answer, if the servo's Status Return Level is at least `least`; otherwise, no answer."""
         return [(servo, errors)] if servo.level >= least else []
 
     def settle(self, servo: Servo, addresses: Iterable[int]) -> None:
-        """Read registers back after a write whose outcome the manual leaves open, or to check it."""
+        """Read registers back, to check a write or to learn its outcome where the manual does not specify it."""
         for address in addresses:
             if (row := servo.rules.rows.get(address)) is not None:
                 self.look(servo, row)

@@ -1,4 +1,4 @@
-"""The servos of a conversation as the host knows them, and the registers with rules of their own."""
+"""What the host of a conversation knows about its servos, and the registers that have special rules."""
 
 from dataclasses import dataclass, field
 
@@ -19,7 +19,7 @@ NUMBERS = {
 }
 DELAY, SHADOW, LEVEL, WATCHDOG = 9, 12, 68, 98
 APART = (SERVO_ID, BAUD, DELAY, SHADOW, 20, 31, 32, 34, LEVEL, WATCHDOG, 116)
-"""Registers with instructions of their own, and limits whose other values would shut a servo down."""
+"""Registers that are tested separately, and limits that would shut a servo down if they were changed."""
 UNDEFINED = (15, 72, 94, 150)
 NOBODY = 251
 QUIET_S, BOOT_S, PAUSE_S = 0.02, 0.4, 2e-3
@@ -44,8 +44,8 @@ class Still:
 class Servo:
     """One servo as the manual describes it.
 
-    backup: what its backup holds; None without one. alert: whether it has a hardware error. indirect: its indirect
-    data.
+    backup: contents of its backup; None if there is no backup. alert: whether it has a hardware error. indirect: its
+    indirect data.
     """
 
     model: str

@@ -1,4 +1,4 @@
-"""Instructions to one servo, and those that broadcast the same to all."""
+"""Instructions to one servo, and their broadcasts to all servos."""
 
 from benchmarks.bus import codec
 from benchmarks.bus.codec import BROADCAST, Status, packet
@@ -34,7 +34,7 @@ from benchmarks.bus.servo_rules import (
 
 
 class SingleInstructions(Host):
-    """A host that sends these instructions, right and wrong ones."""
+    """A host that sends these instructions, both valid and invalid."""
 
     def ping(self) -> None:
         servo_id = self.random.choice([*(servo.id for servo in self.servos), NOBODY])
@@ -44,7 +44,7 @@ class SingleInstructions(Host):
             self.compare_ping(status)
 
     def found(self, servo: Servo) -> None:
-        """Ping it: it must answer."""
+        """Ping a servo, which must answer."""
         for status in self.ask("ping", packet(servo.id, codec.PING), [(servo, {FINE})]):
             self.compare_ping(status)
 
@@ -56,7 +56,7 @@ class SingleInstructions(Host):
             self.differ(f"ping of {servo.model}, expected {wanted.hex(' ')}", status.data.hex(" "))
 
     def ping_all(self) -> None:
-        """All answer, here in the order of their IDs (the manual: "according to their arranged order")."""
+        """Ping all servos, which must answer in the order of their IDs ("according to their arranged order")."""
         wanted = [(servo, {FINE}) for servo in sorted(self.servos, key=lambda servo: servo.id)]
         for status in self.ask("ping_all", packet(BROADCAST, codec.PING), wanted):
             self.compare_ping(status)
@@ -71,7 +71,7 @@ class SingleInstructions(Host):
         self.ask(f"read_undefined {address}", packet(servo.id, codec.READ, body), self.answers(servo, {ACCESS}, 1))
 
     def read_span(self) -> None:
-        """Neighbouring registers at once; bytes that no register defines may have any value, or be refused."""
+        """Read adjacent registers at once; undefined bytes may have any value, or cause the read to be refused."""
         servo = self.any_servo()
         first, size = self.row(servo, writable=False).address, self.random.randint(1, 60)
         body = first.to_bytes(2, "little") + size.to_bytes(2, "little")
@@ -86,7 +86,7 @@ class SingleInstructions(Host):
             self.differ(f"read_span {first} {size}", got)
 
     def malformed(self) -> None:
-        """Instructions with too few or too many parameters change nothing."""
+        """Send instructions with too few or too many parameters, which must change nothing."""
         servo = self.any_servo()
         row = self.row(servo, writable=False)
         at = row.address.to_bytes(2, "little")
@@ -118,7 +118,7 @@ class SingleInstructions(Host):
         self.settle(servo, [row.address])
 
     def goal_position(self) -> None:
-        """In position mode within its limits; the extended modes allow 256 turns either way."""
+        """Write Goal Position; position mode allows values within its limits, other modes 256 turns either way."""
         servo = self.any_servo()
         held = servo.rules.held
         if held.get(WATCHDOG) or 48 not in held or 52 not in held or 11 not in held:
@@ -136,7 +136,7 @@ class SingleInstructions(Host):
                 self.differ(f"goal_position {goal}", read)
 
     def watchdog(self) -> None:
-        """It trips only with torque on and without packets, reads -1 then, refuses goals, and 0 ends that."""
+        """Check that Bus Watchdog trips only with torque on and no packets, and blocks goals until it is cleared."""
         servo = self.any_servo()
         if servo.level < 2 or servo.alert:
             return
@@ -162,8 +162,8 @@ class SingleInstructions(Host):
         self.settle(servo, [WATCHDOG, TORQUE_ENABLE])
 
     def alarm(self) -> None:
-        """A supply below Min Voltage Limit: every status has the alert; torque is off if Shutdown has that bit; only a
-        reboot with the limit restored ends it.
+        """Set Min Voltage Limit above the supply: every status then has the alert, and torque is off if Shutdown has
+        that bit; only restoring the limit and rebooting ends this.
         """
         servo = self.any_servo()
         held = servo.rules.held
@@ -203,7 +203,7 @@ class SingleInstructions(Host):
         self.ask(f"write {address} {data.hex(' ')}", packet(servo.id, codec.WRITE, body), self.answers(servo, may))
 
     def write_wrongly(self) -> None:
-        """A read-only or undefined address, or too few bytes."""
+        """Write to a read-only or undefined address, or write too few bytes."""
         servo = self.any_servo()
         row = self.row(servo, writable=False)
         choice = self.random.randrange(3)
@@ -239,7 +239,7 @@ class SingleInstructions(Host):
         self._registered(servo)
 
     def _forget_waiting(self, servo: Servo) -> None:
-        """Empty the servo's registered instruction, since nothing was said of it."""
+        """Clear the servo's registered instruction, since a silent servo may or may not have accepted it."""
         may = servo.rules.action() | {FINE, INSTRUCTION}
         self.ask("action", packet(servo.id, codec.ACTION), self.answers(servo, may | set(range(1, 8))))
         servo.rules.waiting = None
@@ -250,7 +250,7 @@ class SingleInstructions(Host):
         servo.rules.held.setdefault(TORQUE_ENABLE, 0)
 
     def _registered(self, servo: Servo) -> None:
-        """Registered Instruction is 1 exactly while one waits."""
+        """Check that Registered Instruction is 1 if an instruction is waiting, and 0 otherwise."""
         got = self.ask("read 69", packet(servo.id, codec.READ, b"\x45\0\1\0"), self.answers(servo, {FINE}, 1))
         if got and got[0].data[0] != (servo.rules.waiting is not None):
             self.differ(f"Registered Instruction with {servo.rules.waiting}", got)
@@ -264,7 +264,7 @@ class SingleInstructions(Host):
         self._registered(servo)
 
     def action_all(self) -> None:
-        """Nobody answers, all act."""
+        """Broadcast Action: no servo answers; all act."""
         waiting = [(servo, servo.rules.waiting) for servo in self.servos if servo.rules.waiting is not None]
         for servo, _ in waiting:
             servo.rules.action()
@@ -311,7 +311,7 @@ class SingleInstructions(Host):
         self._follow(servo)
 
     def factory_reset_all(self) -> None:
-        """The manual: "will NOT be activated" (from firmware 42)."""
+        """Broadcast Factory Reset, which has no effect (the manual: "will NOT be activated", from firmware 42)."""
         self.ask("factory_reset_all", packet(BROADCAST, codec.FACTORY_RESET, b"\xff"), [])
         self.settle(self.any_servo(), [TORQUE_ENABLE, SERVO_ID])
 
@@ -322,7 +322,7 @@ class SingleInstructions(Host):
         self.ask(f"clear {body.hex(' ')}", packet(servo.id, codec.CLEAR, body), self.answers(servo, errors))
 
     def back_up(self) -> None:
-        """Backup and restore need torque off (x/backup_ready); older firmware does not know them."""
+        """Back up or restore; both need torque off (x/backup_ready), and older firmware does not support them."""
         servo, restore = self.any_servo(), self.random.random() < 0.5
         rules = servo.rules
         raw = packet(servo.id, codec.BACKUP, bytes((2 if restore else 1,)) + b"CTRL")
@@ -361,14 +361,14 @@ class SingleInstructions(Host):
             servo.indirect[:] = got[0].data
 
     def _settle_connection(self, servo: Servo) -> None:
-        """After a restore, ID and rate are as before; delay and level are those of the backup, or not."""
+        """Read the level after a restore, which keeps ID and baud rate but may change Status Return Level and delay."""
         servo.rules.held[SHADOW] = servo.rules.held.get(SHADOW, 255)
         servo.rules.held.pop(LEVEL, None)
         got = self.send(packet(servo.id, codec.READ, bytes((LEVEL, 0, 1, 0))))
         servo.rules.held[LEVEL] = codec.statuses(got)[0].data[0] if got else 0
 
     def _follow(self, servo: Servo) -> None:
-        """Look for the servo at the rate that it must have, and bring it back to the others'."""
+        """Ping the servo at the baud rate that it must have, and return it to the rate of the others."""
         if BAUD_RATES[servo.rules.held[BAUD]] == 1_000_000:
             self.found(servo)
             return

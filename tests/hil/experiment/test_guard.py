@@ -113,7 +113,7 @@ def test_replies_may_be_missing_but_not_too_many_in_a_row(arm: Arm) -> None:
         ((False, True), "Requests or replies are lost: check its cable and its supply."),
         (
             (True, True),
-            "No servo was heard; requests or replies are lost: check the adapter, the cables and the supply.",
+            "No servo replied; requests or replies are lost: check the adapter, the cables and the supply.",
         ),
     ],
 )
