@@ -1,19 +1,11 @@
 """mujoco.sysid on the recordings of benchmarks/chain.py; the extra `peers` installs it.
 
 The arm is a MuJoCo model with the described geometry and masses. The unknowns are the pseudo-inertia of every link (10
-<<<<<<< HEAD
-each, a Cholesky factor relative to the description's), and armature, damping, friction loss and a constant torque of
-every joint, about as many as stage 2's. The arm would fall in an open-loop simulation, so the software spring and
-damper are part of the model, as an affine bias. The method gets every advantage: the true lag, the initial state of the
-period's Fourier coefficients, an initial guess as good as ours, its own optimiser with rollouts on all cores, and two
-integration steps per sample.
-=======
 parameters of a Cholesky factor relative to the description's), and armature, damping, friction loss and a constant
 torque of every joint. Their number is about that of hil's stage 2. The arm would fall in an open-loop simulation, so
 the software spring and damper are part of the model, as an affine bias. The method gets every advantage: the true lag,
 an initial state from the Fourier series of the period, an initial guess as good as hil's, its own optimiser with
 rollouts on all cores, and two integration steps per sample.
->>>>>>> e1
 """
 
 import io
