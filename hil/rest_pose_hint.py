@@ -30,7 +30,7 @@ def rest_pose_hint(position: float, rest: float, tolerance: float, zero_ticks: i
         zero_ticks: value of this key that would make the present position the rest pose.
     """
     mirrored = (
-        "In a first run, check direction: with the opposite sign, the joint would be in its rest pose. "
+        "If this is the first run, check `direction`: with the opposite sign, the joint would be in its rest pose. "
         if abs(-position - rest) <= tolerance
         else "If direction or id is that of another joint, correct it first. "
     )

@@ -1,1 +1,1 @@
-"""Preparing servos for an experiment: held arms, saving and restoring settings, and checks of each servo."""
+"""Preparing servos for an experiment: taking over held arms, saving and restoring settings, and checking each servo."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.models.model import LEVER_STD, Model
-from hil.estimator.models.terms import BEYOND_SPEEDS, Scale, joint_of, kind_of, term_of
+from hil.estimator.models.terms import BEYOND_SPEEDS, Scale, Term, joint_of, kind_of, term_of
 from hil.estimator.options import CoordinateOptions
 
 TYPICAL_SATURATION = 0.02  # typical fraction of the RMS torque lost; only a scale
@@ -266,12 +266,17 @@ class Sizes:
 
 
 def highest_values(names: tuple[str, ...], speeds: Array) -> Array:
-    """Return the upper bounds that `Term.fastest` declares (parameters,), inf for other parameters.
+    """Return the upper bounds that `Term.fastest` and `Term.largest` declare (parameters,), inf for other parameters.
 
     speeds: highest speed of each joint (joints,) [rad/s].
     """
-    times = [(term_of(name).fastest, joint_of(name) or 1) for name in names]
-    return np.array([np.inf if most is None else most * float(speeds[joint - 1]) for most, joint in times])
+    return np.array([_highest_value(term_of(name), float(speeds[(joint_of(name) or 1) - 1])) for name in names])
+
+
+def _highest_value(term: Term, speed: float) -> float:
+    if term.fastest is not None:
+        return term.fastest * speed
+    return np.inf if term.largest is None else term.largest
 
 
 def scales_of(names: tuple[str, ...], sizes: Sizes) -> Array:

@@ -115,6 +115,12 @@ class Term:
     A Stribeck rise that never falls is Coulomb friction, and a Coulomb step that is never completed is viscous
     friction.
     """
+    largest: float | None = None
+    """Upper bound [unit]; None for no bound.
+
+    A ratio to a term that is absent, such as the rise above a Coulomb friction of zero, would otherwise grow without
+    limit, and at speeds that the recording lacks, the model would predict absurd torques.
+    """
     max_step: float | None = None
     """Maximum change in the term's coordinate (for positive terms, a logarithm) per iteration; None for the fit's
     limit.
@@ -185,6 +191,7 @@ _DECLARED = (
         "Stribeck rise above Coulomb friction at low speed, as a fraction of it",
         part="stribeck",
         initial=0.2,
+        largest=10.0,
         max_step=1.0,
         standstill=True,
     ),

@@ -372,7 +372,7 @@ class FakeBus:
         return bool(self.faults.on_answers)
 
     def fault_error(self, servo: EmulatedServo, now: float) -> int:
-        """Return the ERR byte with which an active fault makes this servo answer; 0 without a fault."""
+        """Return the ERR byte of this servo's replies while a fault is active; 0 if none is."""
         return self.faults.error(servo.id, now - self._origin)
 
     def count_collision(self) -> None:

@@ -123,7 +123,7 @@ def settling_text(config: Config, prediction: Prediction) -> str:
         return (
             f"No simulated arm settled within {config.experiment.max_settling_periods} periods: such a run records no "
             "settled period to estimate from, even if it is safe. A longer period, higher frequencies, another torque "
-            "or experiment.max_settling_periods may help."
+            "or a larger experiment.max_settling_periods may help."
         )
     seconds = config.experiment.ramp + config.experiment.period * float(
         np.quantile(prediction.settled_after[settled], 0.99)

@@ -280,5 +280,5 @@ def _unlike_armed(longer: int) -> str:
 
 
 def _wrapped(seconds: float) -> float:
-    """Wrap a difference of two clocks to plus or minus half of the period of a servo's clock."""
+    """Wrap a difference between two clocks to within half of the time after which a servo's clock starts again."""
     return (seconds + 0.5 * _WRAP_S) % _WRAP_S - 0.5 * _WRAP_S

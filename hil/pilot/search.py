@@ -273,8 +273,8 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """Return `found`; if it leaves much of the position range unused, try other waves and return the amplitude that
-        uses most of the range.
+        """Return `found` or, if it leaves much of the position range unused, the best of it and other waves: the
+        amplitude whose motion covers the largest part of the range.
         """
         options = self.options
         limited = (found.peak_torque >= options.at_limit * most_torque(config)).all() or self.cap is not None

@@ -66,7 +66,7 @@ def plan_of(config: Config) -> Plan:
 
 
 def missing_path(config: Config) -> str:
-    """Message saying that a spatial arm without a pilot lacks its path; "" if nothing is missing."""
+    """Return what to do about a missing [joint_path], which a spatial arm without a pilot needs; "" if it is there."""
     if config.joint_path is not None:
         return ""
     return (

@@ -43,7 +43,7 @@ def write_recording_report(folder: Path, out: Path | None = None) -> Path:
 
 
 def recording_figures(folder: Path) -> list[Figure]:
-    """All figures of the report of a recording folder, in order."""
+    """All figures in the report on a folder of estimates from recordings, in order."""
     return figures_in(_sections(_load(folder)))
 
 

@@ -9,7 +9,9 @@ from hil.rest_pose_hint import rest_pose_hint, within_limits
 
 def test_a_wrong_direction_is_recognised_by_its_mirror_image() -> None:
     said = rest_pose_hint(1.55, -1.57, 0.1, 3072)
-    assert said.index("it may have fallen since an earlier run") < said.index("In a first run, check direction")
+    assert said.index("it may have fallen since an earlier run") < said.index(
+        "If this is the first run, check `direction`"
+    )
     assert "leave them as they are" in said
 
 

@@ -117,7 +117,7 @@ def _norms_by_kind(norm: Array) -> Array:
 
 
 def _independent(Y: Array, order: list[int]) -> Columns:
-    """Return the linearly independent columns of `Y`, whose columns are scaled by the largest of their kind."""
+    """Return the linearly independent columns of `Y`, in which parameters of one kind have comparable columns."""
     left = Y[:, order].copy()
     kept: list[int] = []
 

@@ -161,13 +161,13 @@ MEMORY = np.dtype(
 
 position, velocity, turn: latest values, and latest change of velocity [rad, rad/s]; the position is NaN before the
 first one and after a long gap. unsure: uncertainty of the time of the latest measurement [s]. seconds, moved,
-difference, unknown, most_curved: sums (for the last one, the maximum) since the long memory was last updated. seen:
-`difference` without motion that the velocity register cannot show. headed: time of motion in the positive direction
-minus that in the negative one since then [s]. rough: sum of squares of the errors that velocity jumps may cause in each
-interval since then [rad^2]. heading, roughness, moving: in the slow memory, `headed`, `rough` and the time in motion
-[s]. learnt: information from which lag and scale error were estimated [rad^2/s]. lag, scale: their largest accepted
-values [s, 1]. The remaining fields hold the range of the bias and the sums from which lag and scale error are
-estimated.
+difference, unknown: sums since the long memory was last updated; most_curved: the maximum since then. seen:
+`difference`, except for motion that is too slow for the velocity register. headed: time of motion in the positive
+direction minus time of motion in the negative direction, since the same update [s]. rough: sum of squares of the errors
+that velocity jumps may have caused since then [rad^2]. heading, roughness, moving: what the slow memory holds of
+`headed`, `rough` and the time in motion [s]. learnt: information from which lag and scale error were estimated
+[rad^2/s]. lag, scale: their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the
+sums from which lag and scale error are estimated.
 """
 
 

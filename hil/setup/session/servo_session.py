@@ -269,7 +269,7 @@ def _end(session: ServoSession, stopped: BaseException | None) -> None:
             if bus.port.strangers and not isinstance(stopped, BusShared):
                 left.append(
                     "Another program sent packets on this bus while the servos were being set up or restored. End it "
-                    "before the next start: it may move the arm."
+                    "before you start hil again: it may move the arm."
                 )
     except BaseException as signalled:
         for line in getattr(stopped, "__notes__", []):

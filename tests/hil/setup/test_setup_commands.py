@@ -183,7 +183,7 @@ def test_check_reports_a_path_that_a_run_would_refuse() -> None:
     [
         ((SERVO_2, SERVO_2 + "return_delay_us = 500\n"), "return delay", Level.WARNING, "--return-delay-us 0"),
         ((SERVO_2, SERVO_2 + 'registers = { "Drive Mode" = 8 }\n'), "drive mode", Level.STOP, "torque on"),
-        ((SERVO_2, SERVO_2 + 'registers = { "Drive Mode" = 1 }\n'), "drive mode", Level.STOP, "again, with hil init"),
+        ((SERVO_2, SERVO_2 + 'registers = { "Drive Mode" = 1 }\n'), "drive mode", Level.STOP, "them with hil init"),
         ((SERVO_2, SERVO_2 + 'registers = { "Homing Offset" = -1025 }\n'), "homing offset", Level.STOP, "to 4"),
         ((SERVO_2, SERVO_2 + 'registers = { "Current Limit" = 100 }\n'), "current limit", Level.STOP, "is 0.8 A"),
         ((SERVO_2, SERVO_2 + 'registers = { "Shutdown" = 0 }\n'), "shuts down on", Level.WARNING, "factory value"),

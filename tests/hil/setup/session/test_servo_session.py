@@ -260,7 +260,7 @@ def test_a_servo_that_rebooted_is_named_with_those_that_were_fine(
     cause = str(stop.value)
     assert re.search(r"answers again\. Joint .* was rebooted: its Bus Watchdog", "\n".join(stop.value.__notes__))
     if servo == 1:  # it hides the second one
-        assert "'elbow' (ID 2, XM430-W350) answered afterwards and joint 'shoulder' (ID 1, XM430-W350) did not" in cause
+        assert "'elbow' (ID 2, XM430-W350) answered and joint 'shoulder' (ID 1, XM430-W350) did not" in cause
         assert "adapter" not in cause, "the fault is not in what all servos share"
     assert bench.changed() == []
 
