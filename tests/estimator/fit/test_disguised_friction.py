@@ -35,13 +35,22 @@ def test_no_step_takes_a_speed_far_beyond_those_of_the_motion() -> None:
 
 
 def test_a_rise_that_never_falls_becomes_coulomb_friction() -> None:
-    x = np.concatenate((COORDINATES.coordinates(np.array([0.001, 0.01, 40.0, 11.0])), [0.7]))
+    x = np.concatenate((COORDINATES.coordinates(np.array([0.005, 0.01, 7.2, 11.0])), [0.7]))
     plain = COORDINATES.undisguised(x)
     coulomb, width, rise, velocity = COORDINATES.values(plain[:4])
     assert coulomb == pytest.approx(0.041, rel=0.05)
     assert width == pytest.approx(0.01) and rise < 0.1 and velocity < 0.5 and plain[4] == 0.7
     real = COORDINATES.coordinates(np.array([0.1, 0.01, 0.5, 0.9 * TOP_SPEED]))
     assert np.array_equal(COORDINATES.undisguised(real), real)
+
+
+def test_a_rise_above_no_friction_stays_bounded() -> None:
+    x = COORDINATES.coordinates(np.array([1e-9, 0.01, 1e7, 0.2]))
+    for _ in range(12):
+        least, most = np.full(4, -2.0), np.full(4, 2.0)
+        COORDINATES.limit(x, least, most, max_relative_decrease=0.5)
+        x = COORDINATES.moved(x, most)
+        assert COORDINATES.values(x)[2] == pytest.approx(10.0)
 
 
 def test_what_only_their_sum_determines_has_no_small_standard_error() -> None:
