@@ -142,6 +142,8 @@ def _tell_doubts(config: Config, tell: OnProgress) -> None:
 
 
 def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: Path) -> list[str]:
+    if not run.path.is_dir():
+        return []  # another program replaced it; the error says where the samples are
     if isinstance(stopped, KeyboardInterrupt | StopRequested | RunFolderError):
         said = after_a_stop(run, command, shown)
     else:

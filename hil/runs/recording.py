@@ -159,7 +159,7 @@ class Recorder:
         self._bytes = memoryview(b"")
         try:
             self._samples = _cut(self._path, self._samples, self.count)
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             self._samples = self.samples.copy()
             lost = self._save_again()
         except OSError as error:
@@ -172,11 +172,13 @@ class Recorder:
         raise lost from None
 
     def _save_again(self) -> RunFolderError:
-        folder = self._path.parent
-        said = f"{folder} was removed or renamed while the run was being recorded"
+        former = folder = self._path.parent
+        said = f"{former} was removed or renamed while the run was being recorded"
+        if former.exists() and not former.is_dir():
+            folder = former.with_name(f"{former.name}-saved")
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            np.save(self._path, self._samples)
+            np.save(folder / self._path.name, self._samples)
             for name, contents in self._beside.items():
                 if not (folder / name).exists():
                     (folder / name).write_bytes(contents)

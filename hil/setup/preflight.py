@@ -29,6 +29,7 @@ from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.setup.bus_rate import check_rate, goals_taken, seldom_as_measured
 from hil.setup.others import others_on_the_bus
 from hil.setup.session.killed_run import recover
+from hil.setup.session.settings_file import DamagedSettings
 
 _WARM_BELOW_LIMIT_C = 15
 _LONG_RETURN_DELAY_US = 20
@@ -232,6 +233,9 @@ def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding
     what = "settings from an earlier run"
     try:
         restored = recover(servo, config.url)
+    except DamagedSettings as error:
+        yield Finding(Level.STOP, str(joint), what, "cannot be read", str(error))
+        return
     except DriverError as error:
         yield Finding(Level.WARNING, str(joint), what, "cannot be restored", str(error))
         return

@@ -45,7 +45,7 @@ class SavedSettings:
     """Servos whose Current Limit another program has left too low for this run; the file keeps its former value."""
 
     def look_for_left(self) -> None:
-        """Find the settings that an earlier run on this port did not restore."""
+        """Find the settings that an earlier run on this port did not restore. Raises DamagedSettings."""
         url = self.bus.port.url
         self.left = {joint: kept for joint in self.bus.drives if (kept := left_behind(url, joint)) is not None}
 
@@ -79,9 +79,10 @@ class SavedSettings:
         try:
             self.kept[joint] = settings_file.keep(url, joint.id, model, settings, changed, since)
         except RunFolderError as error:
+            values = ", ".join(f"{name} {value}" for name, value in settings.items())
             self._say(
-                f"The settings of {joint} cannot be saved: {error} If this program is killed, the servo's Operating "
-                f"Mode {settings['Operating Mode']} and Current Limit must be restored by hand."
+                f"The settings of {joint} cannot be saved where the next run would find them: {error} If this program "
+                f"is killed, restore them by hand ({values}); a run folder's {settings_file.COPY_NAME} holds them too."
             )
             self.kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")
 
@@ -129,8 +130,10 @@ class SavedSettings:
     def forget(self, restored: Iterable[Joint]) -> None:
         """Remove the files of these servos, except where a goal or limit has yet to be restored."""
         for joint in restored:
-            if joint not in self._refused and (not self.reduced[joint] or joint in self.left):
-                settings_file.forget(self.kept[joint])
+            if joint in self._refused or (self.reduced[joint] and joint not in self.left):
+                continue
+            if left := settings_file.forget(self.kept[joint]):
+                self._say(left)
 
     def _differs(self, joint: Joint) -> DriverError | None:
         """Return the error for a servo whose settings cannot be read or do not read back as restored, or None."""

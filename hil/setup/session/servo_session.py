@@ -31,7 +31,6 @@ from hil.setup.session.unrestored import unrestored
 from hil.setup.unmoved import Lies, where_it_lies
 
 __all__ = [
-    "SETTINGS_NAME",
     "Say",
     "ServoSession",
     "has_moved",
@@ -42,9 +41,6 @@ __all__ = [
 ]
 
 Say = Callable[[str], None]
-
-SETTINGS_NAME = "servo_settings.json"
-"""Name of the copy of the saved settings in the run folder."""
 
 _MOST_CUTS = 5
 """Largest number of times that torque is cut again at the end if another program switches it on."""
@@ -116,7 +112,7 @@ class ServoSession:
         self.settings = settings_now(bus)
         if folder is not None:
             copies = {str(joint.id): kept.settings for joint, kept in self.saved.kept.items()}
-            settings_file.write_durably(folder / SETTINGS_NAME, {"port": bus.port.url, "servos": copies})
+            settings_file.write_durably(folder / settings_file.COPY_NAME, {"port": bus.port.url, "servos": copies})
 
     def warn(self) -> None:
         """If the last run was stopped, announce that the arm is about to move again, and give people time to step back.

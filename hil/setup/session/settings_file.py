@@ -16,10 +16,18 @@ from datetime import datetime
 from pathlib import Path
 
 from hil.drivers.adapter.device import adapter_name
+from hil.drivers.errors import WrongSetting
 from hil.errors import RunFolderError
 
 SCHEMA = 1
+COPY_NAME = "servo_settings.json"
+"""Name of the copy of the saved settings in the run folder."""
+
 _LONGEST_NAME = 80
+
+
+class DamagedSettings(WrongSetting):
+    """The file with a servo's saved settings is damaged. Example: the disk failed after the program was killed."""
 
 
 @dataclass(frozen=True)
@@ -99,22 +107,45 @@ def keep(
 
 
 def load(port: str, servo_id: int, model: str) -> Kept | None:
-    """The settings that an earlier program left for this servo; None if there is no readable file."""
+    """The settings that an earlier program left for this servo; None if there are none.
+
+    Raises DamagedSettings if this servo's file exists but does not hold them.
+    """
     own = settings_path(port, servo_id, model)
     device = _device(port)
-    if (kept := _read(own)) is not None or own.exists() or not device or adapter_name(port):
+    contents = _contents(own)
+    kept = None if contents is None else _parsed(contents)
+    if contents is not None and kept is None:
+        raise DamagedSettings(
+            f"{own} is damaged or cannot be read. It held the settings of the {model} with ID {servo_id} from before a "
+            "run that ended without restoring them, so its Operating Mode, limits and goals may still be that run's. "
+            f"Restore them with DYNAMIXEL Wizard 2.0 ({COPY_NAME} in that run's folder is a copy), then remove this "
+            "file."
+        )
+    if kept is not None or not device or adapter_name(port):
         return kept
-    others = map(_read, sorted(state_folder().glob(f"*_ID{servo_id}_{model}.json")))
-    return next((each for each in others if each is not None and each.device == device and not each.adapter), None)
+    others = map(_contents, sorted(state_folder().glob(f"*_ID{servo_id}_{model}.json")))
+    found = (_parsed(each) for each in others if each is not None)
+    return next((each for each in found if each is not None and each.device == device and not each.adapter), None)
 
 
-def _read(path: Path) -> Kept | None:
+def _contents(path: Path) -> bytes | None:
+    """Return the contents of a file, none if they cannot be read; None if there is no such file."""
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError:
+        return b""
+
+
+def _parsed(contents: bytes) -> Kept | None:
+    try:
+        values = json.loads(contents)
         if values.pop("schema") != SCHEMA:
             return None
         kept = Kept(**values)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+    except (ValueError, TypeError, KeyError, AttributeError):
         return None
     numbers = all(
         isinstance(table, dict) and all(type(value) is int for value in table.values())
@@ -123,10 +154,18 @@ def _read(path: Path) -> Kept | None:
     return kept if numbers and type(kept.program) is int else None
 
 
-def forget(kept: Kept) -> None:
-    """Remove the file, because the servo's settings have been restored."""
-    with suppress(OSError):
+def forget(kept: Kept) -> str:
+    """Remove the file, because the servo's settings have been restored. Return why it could not be removed, or ""."""
+    try:
         kept.path.unlink(missing_ok=True)
+    except NotADirectoryError:
+        pass
+    except OSError as error:
+        return (
+            f"{kept.path} cannot be removed: {error.strerror}. Its settings have been restored. Remove it, or the next "
+            "run will restore them again."
+        )
+    return ""
 
 
 def write_durably(path: Path, value: object) -> None:
@@ -146,12 +185,17 @@ def write_durably(path: Path, value: object) -> None:
 def _write(path: Path, value: object) -> None:
     temporary = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}.partial")
     path.parent.mkdir(parents=True, exist_ok=True)
-    with temporary.open("w", encoding="utf-8") as file:
-        json.dump(value, file, indent=2)
-        file.write("\n")
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            json.dump(value, file, indent=2)
+            file.write("\n")
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)

@@ -106,6 +106,19 @@ def test_samples_outlive_their_folder(tmp_path: Path, reason: str) -> None:
     assert load_samples(path, 2)["deadline"].tolist() == [7.0, 8.0]
 
 
+def test_samples_outlive_a_file_in_place_of_their_folder(tmp_path: Path) -> None:
+    path = tmp_path / "run" / "samples.npy"
+    path.parent.mkdir()
+    with (
+        pytest.raises(RunFolderError, match=r"1 samples have been saved again in .*run-saved"),
+        Recorder(path, 2, 9) as recorder,
+    ):
+        recorder.keep(7.0, Phase.REST, 0, -1, state(1))
+        shutil.rmtree(path.parent)
+        path.parent.touch()
+    assert load_samples(tmp_path / "run-saved" / "samples.npy", 2)["deadline"].tolist() == [7.0]
+
+
 def test_of_a_killed_run_the_rows_that_were_taken_are_there(tmp_path: Path) -> None:
     path = tmp_path / "samples.npy"
     recorder = Recorder(path, 2, 50)

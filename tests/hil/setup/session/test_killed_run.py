@@ -1,5 +1,6 @@
 """What a killed program left is restored by the next one, and what was changed since stays."""
 
+import errno
 import os
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ import serial
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import PortLost, TorqueNotOff, WrongSetting
+from hil.errors import RunFolderError
 from hil.fakes.bus.faults import Fault
 from hil.fakes.servo.servo import EmulatedServo
 from hil.setup.preflight import Level, check_arm
@@ -110,7 +112,56 @@ def test_settings_that_cannot_be_saved_are_said_in_one_sentence(
     bus: Any = SimpleNamespace(port=SimpleNamespace(url=config.url))
     settings = {"Operating Mode": 3, "Current Limit": 910}
     SavedSettings(bus, said.append).save(config.bus.joints[0], settings, {})
-    assert "cannot be saved: " in said[0] and ".json cannot be written: Not a directory. If this program" in said[0]
+    assert "cannot be saved where" in said[0] and ".json cannot be written: Not a directory. If this program" in said[0]
+    assert "Operating Mode 3, Current Limit 910" in said[0] and "servo_settings.json" in said[0]
+
+
+def test_nothing_is_left_of_a_file_that_could_not_be_written(
+    state_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(RunFolderError, match="No space left"):
+        settings_file.keep("fake://arm.toml", 1, "XM430-W350", {}, {})
+    assert list(state_folder.rglob("*")) == [] or not [each for each in state_folder.rglob("*") if each.is_file()]
+
+
+@pytest.mark.parametrize("contents", ["", '{"schema": 1, "port": "fa', '{"schema": 99}'])
+def test_a_damaged_file_is_neither_ignored_nor_overwritten(
+    arm: Arm, bench: Bench, state_folder: Path, contents: str
+) -> None:
+    """The servos may still have the killed run's settings, which must not be taken for their own."""
+    config = arm(SHORT)
+    joint = config.bus.joints[1]
+    path = settings_path(config.url, joint.id, joint.servo.name)
+    path.parent.mkdir(parents=True)
+    path.write_text(contents, encoding="utf-8")
+    with (
+        pytest.raises(WrongSetting, match=r"ID2_XM430-W350\.json is damaged .*servo_settings\.json"),
+        servo_session(config),
+    ):
+        pass
+    assert bench.changed() == [] and path.read_text(encoding="utf-8") == contents
+    assert any(
+        finding.level is Level.STOP and "is damaged" in finding.fix and finding.where == str(joint)
+        for finding in check_arm(config)
+    )
+    path.unlink()
+    with servo_session(config):
+        pass
+
+
+def test_a_file_that_cannot_be_removed_is_named(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, said = arm(SHORT), list[str]()
+
+    def read_only(_path: Path, missing_ok: bool = False) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    with servo_session(config, say=said.append):
+        monkeypatch.setattr(Path, "unlink", read_only)
+    assert len([each for each in said if "cannot be removed: Read-only" in each and "Remove it" in each]) == 2
 
 
 class _Gone(BaseException):

@@ -22,8 +22,8 @@ from hil.fakes.bus.faults import Fault
 from hil.setup.preflight import Finding, Level, check_arm
 from hil.setup.session.end_of_session import about_torque
 from hil.setup.session.saved_settings import SavedSettings
-from hil.setup.session.servo_session import COUNT_DOWN_S, SETTINGS_NAME, ServoSession, servo_session
-from hil.setup.session.settings_file import settings_path
+from hil.setup.session.servo_session import COUNT_DOWN_S, ServoSession, servo_session
+from hil.setup.session.settings_file import COPY_NAME, settings_path
 from tests.support.bench import SHORT, Arm, Bench, play
 
 
@@ -33,7 +33,7 @@ def test_a_run_leaves_every_register_as_it_was(arm: Arm, tmp_path: Path, bench: 
     assert all(sorted(set(names)) == ["Current Limit", "Operating Mode"] for names in bench.eeprom.values())
     assert all(len(names) <= 4 for names in bench.eeprom.values())
     assert list(state_folder.glob("*.json")) == [], "nothing is left to restore"
-    kept = json.loads((run.path / SETTINGS_NAME).read_text())["servos"]
+    kept = json.loads((run.path / COPY_NAME).read_text())["servos"]
     assert kept["1"]["Operating Mode"] == 3 and kept["1"]["Current Limit"] == 1193
 
 
