@@ -1,12 +1,13 @@
 """Which settings of a servo are stored, and when none are."""
 
+from contextlib import suppress
 from typing import Any
 
 import pytest
 
 from hil.drivers.control_table import load_control_table
 from hil.drivers.errors import WrongReply
-from hil.drivers.preparation.settings import EEPROM, RAM, read_settings
+from hil.drivers.preparation.settings import EEPROM, PROTECTIVE, RAM, put_back, read_settings
 
 XM430 = load_control_table("XM430-W350")
 
@@ -38,3 +39,38 @@ def test_nothing_is_stored_if_replies_belong_to_earlier_requests(behind: range) 
     servo: Any = Servo(behind)
     with pytest.raises(WrongReply, match="its replies are late and belong to earlier requests"):
         read_settings(servo)
+
+
+class _Restored(Servo):
+    """A servo with torque off that records what is written to it; its Model Number is right."""
+
+    def __init__(self, behind: range) -> None:
+        super().__init__(behind)
+        self.written: list[str] = []
+
+    def read_despite_error(self, register: str) -> int:
+        if register == "Torque Enable":
+            return 0
+        value = self.read(register)
+        return self.table.number if value == XM430["Model Number"].address else value
+
+    def write_despite_error(self, register: str, _value: int) -> None:
+        self.written.append(register)
+
+
+@pytest.mark.parametrize("behind", [range(100), range(1, 100), range(5, 100)])
+def test_late_replies_are_not_taken_for_changes_by_another_program(behind: range) -> None:
+    """EEPROM that nobody has changed is not written."""
+    servo: Any = _Restored(behind)
+    settings = {name: XM430[name].address for name in (*EEPROM, *RAM) if name in XM430}
+    with suppress(WrongReply):
+        put_back(servo, settings)
+    assert not set(servo.written) & set(PROTECTIVE)
+
+
+def test_a_change_by_another_program_is_undone() -> None:
+    servo: Any = _Restored(range(0))
+    settings = {name: XM430[name].address for name in (*EEPROM, *RAM) if name in XM430}
+    restored = put_back(servo, settings | {"Temperature Limit": 80})
+    assert restored["Temperature Limit"] == (XM430["Temperature Limit"].address, 80)
+    assert set(servo.written) & set(EEPROM) == {"Temperature Limit"}
