@@ -4,6 +4,7 @@ __all__ = [
     "BusOverheard",
     "BusShared",
     "DriverError",
+    "InconsistentReplies",
     "NoReply",
     "NotPermitted",
     "PortLost",
@@ -53,6 +54,10 @@ class NoReply(DriverError):
 
 class WrongReply(DriverError):
     """The reply was corrupted or did not match the request. Example: two servos with the same ID reply at once."""
+
+
+class InconsistentReplies(WrongReply):
+    """Readings of one register differ. Example: a device between adapter and servo repeats earlier replies."""
 
 
 class ServoRefused(DriverError):

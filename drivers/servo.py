@@ -11,7 +11,7 @@ from typing import TypeVar
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS
 
 from hil.drivers.control_table import ControlTable, Register
-from hil.drivers.errors import NoReply, ServoRefused, WrongReply
+from hil.drivers.errors import InconsistentReplies, NoReply, ServoRefused, WrongReply
 from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError
 from hil.drivers.port import Port
 from hil.drivers.sdk_port import PATIENCE_S, ResyncingPacketHandler, SdkPort
@@ -21,6 +21,9 @@ _T = TypeVar("_T")
 _ATTEMPTS = 3
 """Number of attempts at a set-up exchange before a corrupted or missing reply is reported."""
 
+
+_SURE_ATTEMPTS = 3
+"""Number of attempts at a reading that must be confirmed by a second one."""
 
 _LATE_S = 0.06
 """How long after a timed-out exchange its reply may still arrive [s]."""
@@ -69,6 +72,22 @@ class Servo:
     def read_despite_error(self, register: str, attempts: int = _ATTEMPTS) -> int:
         """Read a register like `read`, but also accept a reply that contains the value and reports an error."""
         return self.read_entry(self.table[register], attempts, despite_error=True)
+
+    def read_surely(self, register: str) -> int:
+        """Read a register twice like `read_despite_error`, with the servo's ID in between, until the readings agree.
+
+        A reply does not identify its register: a late one, or one that another device repeats, may belong to an earlier
+        request. Raises InconsistentReplies if they never agree, and the errors of `read`.
+        """
+        for _ in range(_SURE_ATTEMPTS):
+            first = self.read_despite_error(register)
+            is_its_own = self.read_despite_error("ID") == self.id
+            if is_its_own and self.read_despite_error(register) == first:
+                return first
+        raise InconsistentReplies(
+            f"{self.title}: {register} reads differently each time: its replies are late and belong to earlier "
+            "requests. Check the adapter."
+        )
 
     def read_entry(self, entry: Register, attempts: int = _ATTEMPTS, *, despite_error: bool = False) -> int:
         """Read a register that need not be in the model's table. Raises the errors of `read`.

@@ -1,6 +1,6 @@
 """Handling of torque that is already on at the start: either refuse to start, or let the arm sink slowly."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from hil.drivers.clock import Clock
 from hil.drivers.errors import TorqueHeld
@@ -8,7 +8,7 @@ from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
-from hil.drivers.torque.off import has_torque
+from hil.drivers.torque.off import has_torque, signals_held_back
 
 FADE_S = 1.0
 """Time over which a held servo's output limit is reduced to zero [s]."""
@@ -57,24 +57,41 @@ def _current(joint: Joint, servo: Servo) -> str:
 
 
 def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
-    """Ramp the output of held servos down to zero, wait until the joints no longer sink, then cut torque.
+    """Ramp the output of held servos down to zero, wait until the joints no longer sink, then cut torque and restore
+    the goals that limited their output.
 
-    With zero PWM and torque on, the motor's terminals are shorted, so it brakes. Raises the errors of `Servo.write`.
+    With zero PWM and torque on, the motor's terminals are shorted, so it brakes. Raises the errors of `Servo.write`;
+    whatever ends the sinking early gets a note on the goals that are left lowered, since restoring them with torque on
+    would jerk the arm back up.
     """
-    held = {joint: servo for joint, servo in servos.items() if is_held(servo)}
-    goals = {joint: _what_drives(servo) for joint, servo in held.items()}
-    begun = {joint: servo.read(goals[joint]) for joint, servo in held.items()}
-    for step in range(1, _STEPS + 1):
-        clock.wait_until(clock.now() + FADE_S / _STEPS)
-        for joint, servo in held.items():
-            servo.write(goals[joint], round(begun[joint] * (1 - step / _STEPS)))
-    until = clock.now() + SINKING_S
-    while held and clock.now() < until:
-        clock.wait_until(clock.now() + 0.1)
-        if all(abs(servo.read("Present Velocity")) <= _STILL_TICKS for servo in held.values()):
-            break
-    for servo in held.values():
-        servo.write("Torque Enable", 0)
+    held = [servo for servo in servos.values() if is_held(servo)]
+    goals = [(servo, name, servo.read(name)) for servo in held for name in (_what_drives(servo),)]
+    try:
+        for step in range(1, _STEPS + 1):
+            clock.wait_until(clock.now() + FADE_S / _STEPS)
+            for servo, name, begun in goals:
+                servo.write(name, round(begun * (1 - step / _STEPS)))
+        until = clock.now() + SINKING_S
+        while held and clock.now() < until:
+            clock.wait_until(clock.now() + 0.1)
+            if all(abs(servo.read("Present Velocity")) <= _STILL_TICKS for servo in held):
+                break
+    except BaseException as ended:
+        ended.add_note(_lowered(goals))
+        raise
+    with signals_held_back():
+        for servo in held:
+            servo.write("Torque Enable", 0)
+        for servo, name, begun in goals:
+            servo.write(name, begun)
+
+
+def _lowered(goals: Iterable[tuple[Servo, str, int]]) -> str:
+    listed = ", ".join(f"{name} of ID {servo.id}, which was {begun}" for servo, name, begun in goals)
+    return (
+        f"The arm was being let down and has been left with a lowered {listed}. Hold the arm by hand, switch its "
+        "torque off and set this again with DYNAMIXEL Wizard 2.0, or start again with --take-over."
+    )
 
 
 def _what_drives(servo: Servo) -> str:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from types import FrameType
 
-from hil.drivers.errors import DriverError, NoReply, PortLost
+from hil.drivers.errors import DriverError, InconsistentReplies, NoReply, PortLost
 from hil.drivers.joint import Joint
 from hil.drivers.packet import BROADCAST_ID, Instruction, encode
 from hil.drivers.port import Port
@@ -38,9 +38,6 @@ TRIP_S = WATCHDOG_UNIT + 5e-3
 
 _REPEATS, _REPEAT_S = 2, 0.001
 """Number of further torque-off packets and the time between them [s]: a packet that collides with a reply is lost."""
-
-_READINGS = 3
-"""Maximum number of attempts to read Torque Enable twice alike."""
 
 
 @dataclass(frozen=True)
@@ -285,15 +282,12 @@ def is_torque_on(servo: Servo) -> bool | None:
 def has_torque(servo: Servo) -> bool | None:
     """Read whether a servo's torque is on; None if its answers may belong to other requests.
 
-    A reply does not identify its register, so Torque Enable is read twice, with another register in between, and again
-    if the readings disagree, e.g. because another program has changed it. Raises the errors of `Servo.read`.
+    Raises the errors of `Servo.read`, except that of `Servo.read_surely` for readings that disagree.
     """
-    for _ in range(_READINGS):
-        first = servo.read_despite_error("Torque Enable")
-        is_its_own = servo.read_despite_error("ID") == servo.id
-        if is_its_own and servo.read_despite_error("Torque Enable") == first:
-            return bool(first)
-    return None
+    try:
+        return bool(servo.read_surely("Torque Enable"))
+    except InconsistentReplies:
+        return None
 
 
 def was_rebooted(servo: Servo) -> bool | None:

@@ -15,7 +15,7 @@ from hil.clearance.doubts import doubts
 from hil.config.schema import Config
 from hil.drivers.errors import DriverError
 from hil.dry_run.ensemble import earlier_result
-from hil.errors import ConfigError, RunFolderError, StopRequested
+from hil.errors import ConfigError, ExperimentError, RunFolderError, StopRequested
 from hil.estimation.after_a_stop import after_a_failure, after_a_stop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
@@ -142,8 +142,6 @@ def _tell_doubts(config: Config, tell: OnProgress) -> None:
 
 
 def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: Path) -> list[str]:
-    if not run.path.is_dir():
-        return []  # another program replaced it; the error says where the samples are
     if isinstance(stopped, KeyboardInterrupt | StopRequested | RunFolderError):
         said = after_a_stop(run, command, shown)
     else:
@@ -170,9 +168,12 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
             if isinstance(stopped, RunFolderError):
                 stopped.exit_code = 1  # the disk became full, or the folder was lost: the input was valid
             with suppress(Exception):  # a failing hint must not hide what stopped the arm, or its torque state
-                for line in _how_to_go_on(stopped, run, command, shown):
+                # If another program replaced the folder, the error says where the samples are.
+                for line in _how_to_go_on(stopped, run, command, shown) if run.path.is_dir() else ():
                     stopped.add_note(line)
-        elif hasattr(stopped, "__notes__") and (isinstance(stopped, DriverError) or _is_unsettled(stopped)):
+        elif hasattr(stopped, "__notes__") and (
+            isinstance(stopped, DriverError | ExperimentError) or _is_unsettled(stopped)
+        ):
             stopped.add_note(next_step("check", shown))
         raise
 

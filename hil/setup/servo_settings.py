@@ -63,16 +63,21 @@ def set_up(
     Raises ServoRefused if a register does not read back as written, WrongSetting if the new ID is taken, and the
     errors of `Servo.read`.
     """
-    changes = []
-    if return_delay_us is not None:
-        changes.append(_set_return_delay(servo, confirm, return_delay_us))
-    if secondary_id is not None:
-        changes.append(_set_secondary_id(servo, confirm, secondary_id))
-    if new_id is not None:
-        change, servo = _set_id(servo, confirm, new_id)
-        changes.append(change)
-    if new_baud is not None:
-        changes.append(_set_baud(servo, confirm, new_baud))
+    changes: list[Change] = []
+    try:
+        if return_delay_us is not None:
+            changes.append(_set_return_delay(servo, confirm, return_delay_us))
+        if secondary_id is not None:
+            changes.append(_set_secondary_id(servo, confirm, secondary_id))
+        if new_id is not None:
+            change, servo = _set_id(servo, confirm, new_id)
+            changes.append(change)
+        if new_baud is not None:
+            changes.append(_set_baud(servo, confirm, new_baud))
+    except BaseException as ended:
+        if done := [f"{each.register} from {each.before} to {each.after}" for each in changes if each.written]:
+            ended.add_note(f"Already changed: {', '.join(done)}.")
+        raise
     return changes
 
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, TorqueNotOff
 from hil.drivers.torque.off import TorqueOff, signals_held_back
-from hil.errors import ExperimentError, StopRequested
+from hil.errors import ExperimentError, HilError
 
 _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
 """Message if every servo has eventually answered and nothing else is wrong."""
@@ -74,7 +74,7 @@ def telling_of_torque(bus: ServoBus) -> Iterator[None]:
     except TorqueNotOff:
         raise
     except BaseException as ended:
-        is_stop = isinstance(ended, KeyboardInterrupt | StopRequested | DriverError)
+        is_stop = isinstance(ended, KeyboardInterrupt | HilError | DriverError)
         told = any(_TELLS_OF_TORQUE.search(note) for note in getattr(ended, "__notes__", []))
         if not told and (is_stop or bus.torque_off_report is not None):
             with signals_held_back():

@@ -152,7 +152,7 @@ class SavedSettings:
     def _check_model(self, servo: Servo) -> None:
         """Raise WrongModel if a servo of another model answers at this servo's ID."""
         found = servo.read_despite_error("Model Number")
-        if found == servo.table.number:
+        if found == servo.table.number or (found := servo.read_surely("Model Number")) == servo.table.number:
             return
         said = f"{servo.title}: a servo of a different model now answers at this ID."
         if found in {other.table.number for other in self.bus.drives.values()}:

@@ -81,7 +81,7 @@ def _changed_delays(saved: SavedSettings, delays: Mapping[Joint, int], silent: C
         now = before
         if joint not in silent:
             with suppress(DriverError):
-                now = saved.bus.drives[joint].read(_DELAY)
+                now = saved.bus.drives[joint].read_surely(_DELAY)
         if now != before:
             yield (
                 f"{joint.title}: {_DELAY} was changed during this command from {2 * before} to {2 * now} us, by "
@@ -97,7 +97,7 @@ def _lowered_limits(saved: SavedSettings, settings: Settings, silent: Collection
         if before is None or joint in silent:
             continue
         with suppress(DriverError):
-            now, wanted = servo.read(_PWM_LIMIT), saved.wanted[joint]
+            now, wanted = servo.read_surely(_PWM_LIMIT), saved.wanted[joint]
             if now == before:
                 continue
             reduced = [
@@ -124,7 +124,7 @@ def _changed_meaning(saved: SavedSettings, settings: Settings, silent: Collectio
             if before is None or joint in silent:
                 continue
             with suppress(DriverError):
-                if (now := servo.read(name)) != before and servo.read(name) == now:
+                if (now := servo.read_surely(name)) != before:
                     yield (
                         f"{joint.title}: {name} was changed during this command from {before} to {now}, by another "
                         f"program or a factory reset, and is left as it is. Set it back to {before} with DYNAMIXEL "

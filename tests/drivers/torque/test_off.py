@@ -12,6 +12,7 @@ from hil.drivers.control_table import load_control_table
 from hil.drivers.errors import DriverError, NoReply, PortLost, WrongReply
 from hil.drivers.joint import Joint
 from hil.drivers.packet import BROADCAST_ID, Instruction, encode
+from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode, servo_model
 from hil.drivers.torque.held import switched_on
 from hil.drivers.torque.off import (
@@ -62,6 +63,7 @@ class Bench:
             id=number,
             table=load_control_table("XM430-W350"),
             read_despite_error=lambda _: self.watchdogs[number],
+            read_surely=lambda _: self.watchdogs[number],
             write_despite_error=write,
             write_once=partial(write, attempts=1),
         )
@@ -224,6 +226,7 @@ class Misunderstood:
         return answer
 
     read_despite_error = read
+    read_surely = Servo.read_surely
 
 
 @pytest.mark.parametrize(

@@ -321,6 +321,19 @@ def test_an_id_that_is_taken_is_not_given_twice(port: Callable[..., Port]) -> No
         set_up(open_servo(port(), 2), lambda _: True, new_id=1, new_baud=None, return_delay_us=None)
 
 
+def test_a_stop_between_two_changes_names_the_first(port: Callable[..., Any]) -> None:
+    questions = iter([True])
+
+    def asked(_question: str) -> bool:
+        if (answer := next(questions, None)) is None:
+            raise KeyboardInterrupt
+        return answer
+
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        set_up(open_servo(port(), 2), asked, new_id=9, return_delay_us=20)
+    assert stopped.value.__notes__ == ["Already changed: Return Delay Time from 0 to 20."]
+
+
 def test_a_servo_with_torque_is_left_alone(port: Callable[..., Port]) -> None:
     opened = port()
     open_servo(opened, 2).write("Torque Enable", 1)

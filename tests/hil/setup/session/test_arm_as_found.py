@@ -8,6 +8,7 @@ import pytest
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import TorqueHeld, WrongSetting
+from hil.drivers.servo import Servo
 from hil.setup.preflight import Finding, Level, check_arm
 from hil.setup.session.servo_session import servo_session
 from tests.support.bench import SHORT, Arm, Bench, play
@@ -131,6 +132,30 @@ def test_a_held_arm_that_is_taken_over_sinks_slowly(arm: Arm, bench: Bench) -> N
         assert not any(servo.torque_enabled for servo in bench.servos.values())
     assert not any(servo.torque_enabled for servo in bench.servos.values())
     assert max(fastest) < 2.0
+    assert all(servo.value("Goal PWM") == 885 for servo in bench.servos.values()), "as it was before"
+
+
+def test_a_stop_while_the_arm_sinks_tells_what_was_lowered(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Restoring the goals with torque on would jerk the arm up."""
+    bench.prepare = hold
+    config = arm(SHORT)
+    taken = config.model_copy(update={"safety": config.safety.model_copy(update={"take_over": True})})
+    steps = iter(range(10))
+
+    def stopping(servo: Servo, register: str, value: int, attempts: int | None = None) -> None:
+        if register == "Goal PWM" and next(steps, None) is None:
+            raise KeyboardInterrupt
+        write(servo, register, value, attempts)
+
+    write = Servo.write
+    monkeypatch.setattr(Servo, "write", stopping)
+    with pytest.raises(KeyboardInterrupt) as stopped, servo_session(taken):
+        pass
+    said = "\n".join(stopped.value.__notes__)
+    assert "TORQUE IS ON" in said and "lowered Goal PWM of ID 1, which was 885, Goal PWM of ID 2, which was 885" in said
+    assert all(0 < servo.value("Goal PWM") < 885 and servo.torque_enabled for servo in bench.servos.values())
 
 
 def test_a_servo_of_somebody_else_keeps_its_torque_and_is_told_of(

@@ -441,7 +441,8 @@ def test_where_one_register_cannot_be_restored_the_message_names_it_and_no_other
 def test_two_servos_of_different_models_that_swapped_their_ids_are_named() -> None:
     tables = [SimpleNamespace(number=number) for number in (1060, 1020)]
     bus: Any = SimpleNamespace(drives={table.number: SimpleNamespace(table=table) for table in tables})
-    answers: Any = SimpleNamespace(table=tables[1], title="Joint 'elbow'", read_despite_error=lambda _: 1060)
+    answers: Any = SimpleNamespace(table=tables[1], title="Joint 'elbow'")
+    answers.read_despite_error = answers.read_surely = lambda _: 1060
     with pytest.raises(WrongModel, match=r"Another joint has a servo of that model: their IDs may have been swapped"):
         SavedSettings(bus, print)._check_model(answers)
 
