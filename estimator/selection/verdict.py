@@ -97,7 +97,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
         _noise(validation) if explained else _unexplained(estimate, validation, evidence, trust),
         *(() if explained or evidence.disturbances else _distorted(validation)),
         *evidence.disturbances,
-        *(() if evidence.disturbances else _drifted(evidence.drift)),
+        *(() if evidence.disturbances else _drifted(evidence.drift, validation)),
         *_pushed(evidence.torque),
         *_predicted(evidence.held_out, evidence.held_out_as_fitted),
         *conflict_sentences(evidence.conflicts, explained),
@@ -235,9 +235,24 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
     return (" ".join((found, *beyond)),)
 
 
-def _drifted(drift: Drift | None) -> tuple[str, ...]:
+def _drifted(drift: Drift | None, validation: Validation) -> tuple[str, ...]:
+    """Return a sentence on each joint whose friction has changed. If much of the motion is unexplained, an effect that
+    the model lacks may only look like such a change.
+    """
     if drift is None:
         return ()
+    if float(validation.residual_over_floor.max()) > MUCH_LEFT:
+        changed = [
+            f"joint {joint + 1} by {100.0 * change:+.2g} %"
+            for joint, (change, std) in enumerate(zip(drift.change.tolist(), drift.std.tolist(), strict=True))
+            if abs(change) > max(LEAST, 3.0 * std)
+        ]
+        if not changed:
+            return ()
+        return (
+            f"Friction seems to have changed within {drift.seconds:.0f} s ({', '.join(changed)}), but as long as the "
+            "motion is not explained, the same missing effect may cause this.",
+        )
     return tuple(
         f"Friction of joint {joint + 1} {'fell' if change < 0.0 else 'rose'} by {percent(abs(change))} within "
         f"{drift.seconds:.0f} s{_reason(change, drift.seconds)}"
@@ -321,6 +336,11 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
         return (f"This motion provides no information about {name}. To identify it, use {improvement}.",)
     if part > WEAK and not _is_weak(validation, name):
         share = 100 * validation.torque_std[name]
+        if part > 1.0:
+            return (
+                f"{name} cannot be distinguished from zero. It hardly affects this arm: its standard error is "
+                f"{share:.2g} % of the fitted motion's torque.",
+            )
         return (
             f"The least certain parameter is {name}, known to within {percent(part)}. It hardly affects this arm: "
             f"its standard error is {share:.2g} % of the fitted motion's torque. To improve it, use {improvement}.",
