@@ -215,7 +215,6 @@ def test_a_parameter_that_is_hardly_there_is_not_known_to_within_thousands_of_pe
         validation,
         relative_std=relative,
         torque_std=dict(validation.torque_std) | {"coulomb_1": 1e-3},
-        weakest="coulomb_1",
     )
     verdict = judge(estimate, faint, Evidence(held_out=np.array([0.002, 0.002])))
     assert verdict.trust == "yes"
