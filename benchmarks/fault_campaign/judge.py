@@ -140,7 +140,9 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
             config, received(config, story), time[driven][-1] - 1e-3 * bound
         )
     left_on = bool(driven[time > story.ended + config.safety.watchdog + 1e-3 * TRIP_MS].any())
-    named, misleading = judge_words(drawn, story.text) if story.code else (None, False)
+    was_killed = any(each.kind == Kind.KILLED and each.start <= story.ended for each in drawn.attacks)
+    # A killed program says nothing; here it lives on, cut off from the bus.
+    named, misleading = judge_words(drawn, story.text) if story.code and not was_killed else (None, False)
     limits = np.array([joint.position_limit for joint in config.joints])
     position = story.record["position"]
     beyond = np.maximum(limits[:, 0] - position.min(axis=0), position.max(axis=0) - limits[:, 1])

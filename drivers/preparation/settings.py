@@ -212,7 +212,9 @@ def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | 
     """
     wanted = attainable(servo, settings)
     for name in reversed((*EEPROM, *_BOUNDS, "Bus Watchdog")):
-        if name in wanted and name in servo.table and (now := servo.read_despite_error(name)) != wanted[name]:
+        if name not in wanted or name not in servo.table or servo.read_despite_error(name) == wanted[name]:
+            continue
+        if (now := servo.read_surely(name)) != wanted[name]:
             return name, now, wanted[name]
     return None
 

@@ -9,6 +9,7 @@ of a stop allows it, the arm is braked before `run` raises; the caller that swit
 """
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import NamedTuple
@@ -184,7 +185,7 @@ class Stream:
             try:
                 self._guard.torque_is_off(dead)
             except SafetyStop as lost:
-                symptom = str(error).partition(": ")[0].rstrip(".")
+                symptom = re.split(r"[.:] ", str(error), maxsplit=1)[0].rstrip(".")  # without its other causes
                 lost.args = (f"{lost} Symptom: {symptom}.",)
                 lost.overruled = True
                 for note in getattr(error, "__notes__", ()):

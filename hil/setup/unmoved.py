@@ -53,8 +53,8 @@ def refuse_moved(before: Lies, now: Lies, bus: ServoBus) -> None:
             raise ExperimentError(
                 f"{drive.title} has turned by {turned:+.3f} rad since this command first read its angle, before "
                 f"torque was switched on; at most {MOST_RAD} is allowed. Let the arm come to rest, then start "
-                "again. Check whether a hand or a cable is pushing or holding it, whether its horn slips, and "
-                "whether another program is changing its settings."
+                "again. Check whether a hand or a cable is pushing or holding it, whether its horn slips, whether its "
+                "encoder has failed, and whether another program is changing its settings."
             )
 
 
