@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 
 from hil.drivers.control_table import Register
-from hil.drivers.errors import DriverError, ServoRefused, TorqueDoubted, WrongReply, WrongSetting
+from hil.drivers.errors import DriverError, InconsistentReplies, ServoRefused, TorqueDoubted, WrongReply, WrongSetting
 from hil.drivers.packet import StatusError
 from hil.drivers.servo import Servo
 
@@ -193,14 +193,27 @@ def _restore(
         if name not in settings or name not in servo.table or name in failures:
             continue
         try:
-            present = servo.read_despite_error(name)
-            if present != settings[name] and name in PROTECTIVE:  # as only another program or a late reply can explain
-                present = servo.read_surely(name)
+            present: int | None = servo.read_despite_error(name)
+            if present != settings[name] and name in EEPROM:
+                present = _surely(servo, name)
             if present != settings[name]:
                 servo.write_despite_error(name, settings[name])
-                written[name] = present, settings[name]
+                if present is not None:
+                    written[name] = present, settings[name]
         except DriverError as error:
             failures[name] = error
+
+
+def _surely(servo: Servo, name: str) -> int | None:
+    """Read a register whose value may be attributed to another program; None if the readings disagree and this program
+    has written the register too. Raises InconsistentReplies if only another program can have changed it.
+    """
+    try:
+        return servo.read_surely(name)
+    except InconsistentReplies:
+        if name in PROTECTIVE:
+            raise
+        return None
 
 
 def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | None:

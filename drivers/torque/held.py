@@ -66,10 +66,12 @@ def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
     """
     held = [servo for servo in servos.values() if is_held(servo)]
     goals = [(servo, name, servo.read(name)) for servo in held for name in (_what_drives(servo),)]
+    is_lowered = False
     try:
         for step in range(1, _STEPS + 1):
             clock.wait_until(clock.now() + FADE_S / _STEPS)
             for servo, name, begun in goals:
+                is_lowered = True
                 servo.write(name, round(begun * (1 - step / _STEPS)))
         until = clock.now() + SINKING_S
         while held and clock.now() < until:
@@ -77,7 +79,8 @@ def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
             if all(abs(servo.read("Present Velocity")) <= _STILL_TICKS for servo in held):
                 break
     except BaseException as ended:
-        ended.add_note(_lowered(goals))
+        if is_lowered:
+            ended.add_note(_lowered(goals))
         raise
     with signals_held_back():
         for servo in held:

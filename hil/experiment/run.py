@@ -194,7 +194,7 @@ def _play(
                 instead.last_samples = error.last_samples
             raise instead from None
         raise
-    said = changed_settings(settings, settings_now(bus)), _moved_without_torque(config, bus, recorder)
+    said = changed_settings(settings, settings_now(bus, settings)), _moved_without_torque(config, bus, recorder)
     return " ".join(each for each in said if each)
 
 
@@ -273,7 +273,7 @@ def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, 
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return
     stop = error if isinstance(error, SafetyStop) else error.__context__
-    now = settings_now(bus)
+    now = settings_now(bus, before)
     explained = stop if isinstance(stop, SafetyStop) and stop.cause in EXPLAINED else None
     if explained is not None and (changed := changed_settings(before, now, explained.cause)):
         later = may_be_later(before, now, explained.cause, modes_seen_ago)

@@ -69,12 +69,13 @@ changed after the stop.
 Settings = Mapping[tuple[Joint, str], int]
 
 
-def settings_now(bus: ServoBus) -> Settings:
+def settings_now(bus: ServoBus, before: Settings | None = None) -> Settings:
     """Read the settings that determine how servos move, what they report and when they protect themselves.
 
     Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
     to an earlier request. If the two readings differ, the value is unknown and omitted, as are all values of a
-    servo whose ID is read wrongly: its replies are late, so even equal values may be those of other registers.
+    servo whose ID is read wrongly: its replies are late, so even equal values may be those of other registers. Values
+    that differ from `before` are confirmed once more, since another program would be accused of the change.
     """
     found: dict[tuple[Joint, str], int] = {}
     report = bus.torque_off_report
@@ -90,7 +91,22 @@ def settings_now(bus: ServoBus) -> Settings:
                 found |= {(joint, each): first[each] for each in known if first[each] == again[each]}
                 if servo.answered_pings_only:
                     found[joint, STATUS_LEVEL] = 0  # until torque was cut
-    return found
+    return found if before is None else _confirmed(bus, before, found)
+
+
+def _confirmed(bus: ServoBus, before: Settings, found: Settings) -> Settings:
+    """Return `found` without the values that differ from `before` and are not read again (`Servo.read_surely`)."""
+    kept = dict(found)
+    for (joint, register), value in found.items():
+        if before.get((joint, register), value) == value or bus.drives[joint].answered_pings_only:
+            continue
+        try:
+            is_sure = bus.drives[joint].read_surely(register) == value
+        except DriverError:
+            is_sure = False
+        if not is_sure:
+            del kept[joint, register]
+    return kept
 
 
 def changed_settings(before: Settings, after: Settings, cause: Cause | None = None) -> str:

@@ -301,7 +301,7 @@ def test_a_servo_that_was_told_to_answer_pings_only_is_named_and_confirmed_off(
 def test_a_mode_that_may_have_changed_after_a_stop_at_a_limit_is_not_said_to_be_its_cause(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch, ago: float
 ) -> None:
-    def change(bus: ServoBus) -> Any:
+    def change(bus: ServoBus, _before: Any = None) -> Any:
         found.append(settings_now(bus))
         if len(found) == 2:  # once torque is off
             ports[0].bus.servos[1].memory.set("Operating Mode", 3)
