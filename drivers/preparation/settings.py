@@ -164,7 +164,7 @@ def _differing(servo: Servo, settings: Mapping[str, int], names: Iterable[str]) 
 
 
 def _refuse_torque(servo: Servo) -> None:
-    if servo.read_despite_error("Torque Enable"):
+    if servo.read_despite_error("Torque Enable") and servo.read_surely("Torque Enable"):
         raise WrongSetting(f"{servo.title}: its settings cannot be restored while its torque is on.")
 
 
