@@ -1,6 +1,8 @@
 """Warnings about the configuration and the description of an arm. They do not prevent an experiment."""
 
+import math
 from collections.abc import Iterator
+from itertools import accumulate
 
 from hil.clearance.space import Space
 from hil.config.chain import described_arm, doubted_gravity, doubted_inertias, doubted_limits
@@ -9,6 +11,9 @@ from hil.config.schema import Config
 from hil.config.varying_delay import varying_delay
 from hil.drivers.servo_prior import servo_prior
 from hil.next_step import command
+
+_LEANS = 0.35
+"""Cosine of a link's angle at rest from which gravity clearly pulls it aside."""
 
 
 def doubts(config: Config) -> Iterator[str]:
@@ -21,6 +26,7 @@ def doubts(config: Config) -> Iterator[str]:
     if said := varying_delay(config):
         yield said
     if not config.is_chain:
+        yield from _leaning(config)
         return
     arm = described_arm(config)
     yield from doubted_inertias(arm)
@@ -30,6 +36,25 @@ def doubts(config: Config) -> Iterator[str]:
     for doubt in space.shapes.doubts:
         yield f"{arm.path.name}: {doubt}"
     yield from unchecked(space)
+
+
+def _leaning(config: Config) -> Iterator[str]:
+    """Yield a warning if a planar arm's links neither hang nor stand at rest: something must hold them there."""
+    if config.arm.gravity == 0.0 or config.stabiliser is not None:
+        return
+    angles = list(accumulate(config.arm.rest_pose))
+    leaning = [
+        (joint, angle) for joint, angle in zip(config.joints, angles, strict=True) if abs(math.cos(angle)) > _LEANS
+    ]
+    if not leaning:
+        return
+    joint, angle = leaning[0]
+    yield (
+        f"At arm.rest_pose, the link of joint {joint.name!r} is {abs(math.degrees(angle + math.pi / 2)) % 360:.0f} "
+        "degrees away from hanging straight down, so without torque only friction or a stop holds it there. A planar "
+        "arm's stops are not part of its model: if it rests against one, change the mounting so that it hangs freely, "
+        "or describe the arm by a URDF, whose joints may rest against their stops."
+    )
 
 
 def unchecked(space: Space) -> Iterator[str]:

@@ -24,9 +24,12 @@ from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.slips.position_jumps import jump_disturbances
 from hil.estimation.slips.rest_shift import rest_shift_warnings
+from hil.estimation.unsettled.causes import stop_in
 from hil.estimator.arrays import Array
+from hil.estimator.data.recording import Recording
 from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import RecordingError
 from hil.estimator.identify import Estimate
 from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import candidates, considered
@@ -36,8 +39,8 @@ from hil.estimator.selection.other_period import predict_period
 from hil.estimator.selection.settled import choose
 from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.trial import Choice
-from hil.estimator.selection.validation import validate
-from hil.estimator.selection.verdict import GOOD_PREDICTION, Evidence, judge
+from hil.estimator.selection.validation import Validation, validate
+from hil.estimator.selection.verdict import GOOD_PREDICTION, MUCH_LEFT, Evidence, judge
 from hil.estimator.simulation.back_emf import neglected
 from hil.plan.plan import HELD_OUT, IDENTIFY
 from hil.plan.stabiliser import stabiliser_share
@@ -103,7 +106,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
         tried_all=choice is not None,
         torque_limit=limit,
         conflicts=conflicts,
-        cause=varying_delay(config),
+        cause=_cause(config, period, validation),
     )
     judged = judge(estimate, validation, evidence)
     checks = Checks(
@@ -129,6 +132,20 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     save_periods(run.path, played)
     run.write_result(result)
     return result
+
+
+def _cause(config: Config, period: SettledPeriod, validation: Validation) -> str:
+    """Return a cause of an unexplained motion: a rate that beats with the servos, or a stop; "" if none is known."""
+    if float(validation.residual_over_floor.max()) <= MUCH_LEFT:
+        return varying_delay(config)
+    when = np.arange(period.samples) / period.rate
+    try:
+        recording = Recording(
+            when, period.torque, period.position, period.position_step, "held", period.command_to_sample
+        )
+    except RecordingError:  # a joint that hardly moved
+        return varying_delay(config)
+    return " ".join(said for said in (varying_delay(config), stop_in([recording])) if said)
 
 
 def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tuple[SettledPeriod | None, list[str]]:

@@ -11,6 +11,7 @@ from hil.estimation.unsettled.local_defects import local_defects, local_residual
 from hil.estimator.arrays import Array
 from hil.estimator.baselines.torque_faults import (
     Clipped,
+    Stop,
     suspect_clipped,
     suspect_drift,
     suspect_late,
@@ -72,12 +73,22 @@ def _stopped_or_clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
     stop, clipped = suspect_stop(recordings), suspect_clipped(recordings)
     if stop is None or any(each.residual < stop.residual for each in clipped if each.joint == stop.joint):
         return _clipped(recordings, clipped)
-    than = "above" if stop.side > 0 else "below"
+    return (_stop_said(stop),)
+
+
+def stop_in(recordings: Sequence[Recording]) -> str:
+    """Return a sentence about a joint that seems to press against a stop; "" if there is none."""
+    stop = suspect_stop(recordings)
+    return "" if stop is None else _stop_said(stop)
+
+
+def _stop_said(stop: Stop) -> str:
+    than, stiffness = "above" if stop.side > 0 else "below", float(f"{stop.stiffness:.2g}")
     return (
         f"Joint {stop.joint} seems to press against something that yields (a stop, a cable or an object) {than} about "
-        f"{stop.at:.3g} rad: with a stiffness of {stop.stiffness:.2g} N m/rad there, inverse dynamics leaves "
+        f"{stop.at:.3g} rad: with a stiffness of {stiffness:g} N m/rad there, inverse dynamics leaves "
         f"{100 * stop.residual:.2g} % of the torque unexplained instead of {100 * stop.residual_given:.2g} %. Record "
-        "a motion that does not reach that angle.",
+        "a motion that does not reach that angle."
     )
 
 
