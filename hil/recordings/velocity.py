@@ -18,6 +18,7 @@ from hil.recordings.units import split_head
 WINDOW = 0.5  # s over which motion is averaged, so that noise and filters of the velocity hardly matter
 FEWEST_WINDOWS = 8
 LONGEST_LAG = 0.3  # s
+LONGEST_GAP = 0.25  # s between rows: a longer one is left out, with all windows that touch it
 ALIKE = 0.99  # correlation of the two motions below which a column is not the velocity of that joint
 APART = 0.04  # relative difference that is worth a warning
 FAR_APART = 0.2  # logarithm of the factor beyond which the result is unusable: inertias are off by 50 %
@@ -104,13 +105,14 @@ def _columns(table: Table) -> list[str]:
 
 
 def _rate(column: str, time: Array, position: Array, velocity: Array) -> Rate | None:
-    known = np.isfinite(time) & np.isfinite(position) & np.isfinite(velocity)
-    time, position, velocity = time[known], position[known], velocity[known]
-    if time.size < FEWEST_WINDOWS or np.any(np.diff(time) <= 0.0) or time[-1] - time[0] < FEWEST_WINDOWS * WINDOW:
+    time, position, velocity = _in_order(time, position, velocity)
+    if time.size < FEWEST_WINDOWS or time[-1] - time[0] < FEWEST_WINDOWS * WINDOW:
         return None
     step = float(np.median(np.diff(time)))
     travelled = np.concatenate(([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time))))
     at = np.arange(time[0] + WINDOW + LONGEST_LAG, time[-1] - WINDOW - LONGEST_LAG, max(step, 0.02))
+    for gap in np.flatnonzero(np.diff(time) > LONGEST_GAP):
+        at = at[(at < time[gap] - WINDOW - LONGEST_LAG) | (at > time[gap + 1] + WINDOW + LONGEST_LAG)]
     if at.size < FEWEST_WINDOWS:
         return None
     moved = _increase(at, time, position)
@@ -125,6 +127,14 @@ def _rate(column: str, time: Array, position: Array, velocity: Array) -> Rate | 
     # Noise on either side would bias a regression on it; the ratio of the sizes is in between.
     factor = float(np.std(each[best]) / np.std(moved))
     return Rate(column, factor, float(lags[best])) if alike[best] > 0.0 else None
+
+
+def _in_order(time: Array, *values: Array) -> tuple[Array, ...]:
+    """Return the rows without missing values, in the order of their times, each time once."""
+    known = np.flatnonzero(np.all(np.isfinite((time, *values)), axis=0))
+    known = known[np.argsort(time[known], kind="stable")]
+    known = known[np.concatenate(([True], np.diff(time[known]) > 0.0))[: known.size]]
+    return tuple(each[known] for each in (time, *values))
 
 
 def _increase(at: Array, time: Array, values: Array) -> Array:
