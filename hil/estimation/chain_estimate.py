@@ -302,7 +302,10 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     said = f"The largest residual ({config.joints[joint].name}) is {over:.2f} times {measured};"
     if is_explained(estimate):
         return f"{said} nothing remains unexplained."
-    causes = "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time"
+    causes = (
+        "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time, joints "
+        "that are in other places or turn about other axes than described"
+    )
     if not estimate.model.base_tilt and np.any(estimate.model.base.chain.gravity):
         causes = f"a base that is not level ([model] base_tilt = true identifies it), {causes}"
     tried = ""

@@ -21,6 +21,9 @@ TIMES_NO_LOAD = 5.0
 _ONE_WAY = 0.7
 """A joint counts as rotating continuously if at least this fraction of its path is in one direction."""
 
+_MOST_DEGREES = 720.0
+"""Largest angle of most joints in degrees; register values of servos are usually larger."""
+
 _OVER_S, _USUAL = 0.02, 0.9
 """Time over which speeds are averaged to suppress noise [s], and the quantile of the speeds that is checked."""
 
@@ -44,12 +47,19 @@ def refuse_degrees(source: str, names: Sequence[str], time: Array, position: Arr
             what = f"it swings through {(high - low) / (2 * math.pi):.2g} turns"
         else:
             continue
+        unit, key = ("encoder ticks", "ticks") if _are_ticks(row[known]) else ("degrees", "deg")
+        turn = " and ticks_per_turn (4096 for X-series servos)" if key == "ticks" else ""
         raise CsvError(
-            f"{source}: column {name!r} goes from {low:.4g} to {high:.4g} rad: {what}. Is it in degrees? Then correct "
-            'the unit in the column\'s header; if the header has none, set position_unit = "deg" in [columns] of '
-            '--config ARM.toml (in Python: config="ARM.toml"). If it is in rad, set position_unit = "rad" there. Check '
-            "the unit of time, too."
+            f"{source}: column {name!r} goes from {low:.4g} to {high:.4g} rad: {what}. Is it in {unit}? Then correct "
+            f'the unit in the column\'s header; if the header has none, set position_unit = "{key}"{turn} in [columns] '
+            'of --config ARM.toml (in Python: config="ARM.toml"). If it is in rad, set position_unit = "rad" there. '
+            "Check the unit of time, too."
         )
+
+
+def _are_ticks(values: Array) -> bool:
+    """Whether these look like the register of a servo: whole numbers, too large for degrees."""
+    return bool(np.all(values == np.round(values)) and np.abs(values).max() > _MOST_DEGREES)
 
 
 def _speed(time: Array, position: Array) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 from hil.estimator.baselines.signs import suspect_signs
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
+from hil.estimator.models.terms import kind_of
 from hil.estimator.selection.verdict import MUCH_LEFT
 
 LEAST_SWING = 30.0  # encoder steps
@@ -58,7 +59,7 @@ def doubts_of(
                 f"{advice}."
             )
     early = [] if cause_known else _early(recordings, estimate)
-    shown = (*warnings, *early, *_weak(estimate, gravity))
+    shown = (*warnings, *early, *_weak(recordings, estimate, gravity))
     return Doubts(tuple(faults), tuple(doubts), shown, " and ".join(reasons))
 
 
@@ -142,13 +143,16 @@ def _early(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[
     ]
 
 
-def _weak(estimate: ShootingEstimate, gravity: bool) -> list[str]:
+def _weak(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool) -> list[str]:
+    """Name base parameters with a large relative error, except for gravity that is known to be negligible."""
     count = len(estimate.model.base_names)
     known = zip(estimate.names[:count], estimate.value, estimate.std, strict=False)
+    torque = float(np.sqrt(np.mean([np.mean(each.torque**2) for each in recordings])))
+    least = {"gravity": torque if gravity else np.inf, "offset": np.inf}
     weak = [
         f"{name} ({100 * std / abs(value):.0f} %)" if std < UNSEEN * abs(value) else f"{name} (not at all)"
         for name, value, std in known
-        if not name.startswith("offset" if gravity else ("offset", "gravity")) and std > WEAK * abs(value)
+        if std > WEAK * max(abs(value), least.get(kind_of(name), 0.0))
     ]
     if not weak:
         return []

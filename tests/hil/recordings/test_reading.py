@@ -456,6 +456,14 @@ def test_angles_beyond_any_arm_are_refused_at_once(scale: float) -> None:
         read(stated)
 
 
+def test_whole_numbers_beyond_degrees_are_taken_for_ticks(tmp_path: Path) -> None:
+    path = tmp_path / "ticks.csv"
+    rows = "".join(f"{0.01 * k:.2f},{round(2048 + 900 * math.sin(0.1 * k))},{k % 7}\n" for k in range(200))
+    path.write_text("t,present_position_1,tau_1\n" + rows, encoding="utf-8")
+    with pytest.raises(CsvError, match=r"Is it in encoder ticks\?.*position_unit = \"ticks\" and ticks_per_turn"):
+        convert(read_tables(path)[0], Columns())
+
+
 def test_a_speed_beyond_any_servo_is_refused_and_rotation_is_not() -> None:
     table = np.column_stack((TIME, 9.0 * TIME, 300.0 * TIME, TORQUES.T))
     lines = [",".join(HEAD), *(",".join(f"{value:.9g}" for value in row) for row in table)]
