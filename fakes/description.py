@@ -197,9 +197,11 @@ def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def found_beside(folder: Path, name: str) -> Path:
-    """Return the path `name` relative to `folder`; if only `folder` itself has a file of that name, return its path."""
-    named = folder / name
-    return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name
+    """Return the path of the file `name`, which is relative to `folder`; if there is none, that of a file of the same
+    base name in `folder` itself, if it exists.
+    """
+    named, beside = folder / name, folder / Path(name).name
+    return beside if beside.is_file() and not named.is_file() else named
 
 
 def _known_names(name: str) -> str:

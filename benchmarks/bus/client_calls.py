@@ -122,7 +122,7 @@ def dynamixel_easy_sdk(device: str) -> Iterator[Call]:
 
 
 def rustypot(device: str) -> Iterator[Call]:
-    """Calls of rustypot on fake_two_link, through its XL430 controller, whose registers have the same addresses."""
+    """Calls made with rustypot to fake_two_link, through its XL430 controller: the register addresses are the same."""
     import rustypot as library
 
     client = library.Xl430PyController(device, BAUD, 0.5)

@@ -236,8 +236,8 @@ class Guard:
         self._noise.begin()
 
     def measure_noise(self, state: State) -> None:
-        """Process an exchange of an arm at rest: until the noise is known, any deviation of a current reading is
-        accepted.
+        """Process an exchange while the arm is at rest: until the noise is known, readings of the motor current may
+        deviate by any amount.
         """
         self._noise.add(state)
 

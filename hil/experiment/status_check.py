@@ -195,7 +195,7 @@ class StatusCheck:
         return readings >= _LEARNT_READINGS and not stale and late * self._interval > 2 * _CLOCK_TOLERANCE_S
 
     def _late(self, joint: int, held: float, former: float, ago: int) -> int:
-        """Return by how many cycles a servo's replies must be late, at least 0.
+        """Return the smallest delay [cycles] of a servo's replies that explains its goals, 0 if none does.
 
         held: the goal reported now [A or V]. former: the wrong goal reported `ago` cycles earlier [A or V]. Replies are
         late if `held` had already been sent at that time.

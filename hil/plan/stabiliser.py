@@ -99,7 +99,7 @@ def too_slow(config: Config) -> str:
             return (
                 f"experiment.rate = {rate:g} is too low for the stabiliser of joint {joint.name!r}: its torque is "
                 f"based on a state {1e3 * DELAY_SAMPLES / rate:.0f} ms old. A stiffness of {stiffness:g} N m/rad then "
-                f"acts like a damping of -{drives:.2g} N m s/rad, but the stabiliser and friction together damp with "
+                f"acts like a damping of -{drives:.2g} N m s/rad, but the stabiliser and friction together provide "
                 f"only {damps:.2g}. Raise the rate to at least {ceil(rate * drives / damps)} Hz, lower "
                 "stabiliser.stiffness, or raise stabiliser.damping."
             )
