@@ -219,6 +219,8 @@ class Lever:
     """`Model.lever` [s^2]."""
     std: float
     """Standard deviation of coupling - ratio gravity_2 [kg m^2]."""
+    is_doubted: bool = False
+    """Whether `std` has been increased because the motion contradicts the prior."""
 
     @classmethod
     def of(cls, model: Model, gravity_2: float, sizes: "Sizes") -> "Lever | None":

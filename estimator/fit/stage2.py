@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
@@ -30,7 +31,7 @@ from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.fit.stage1 import LinearEstimate
 from hil.estimator.models.bounds import beyond_range, finite_std, matters, step_beyond
-from hil.estimator.models.model import Model
+from hil.estimator.models.model import LEVER_DOUBTED, Model
 from hil.estimator.models.terms import FRICTIONS, term_of
 from hil.estimator.options import LikelihoodOptions
 from hil.estimator.simulation.back_emf import limited
@@ -273,6 +274,12 @@ def _fit(
     objective, x, count = refined.weighted, minimum.x, refined.weighted.count
     positions = objective.positions(x)
     errors = _errors(periods, objective, x, positions, options)
+    if ftol is not None and (doubted := _doubting(objective, minimum, errors)) is not objective:
+        try:
+            found = doubted.minimise(x, ftol)
+        except ConvergenceError:
+            found = Minimum(x, doubted.evaluate(x), minimum.iterations)
+        return _fit(periods, replace(refined, weighted=doubted), found, options, ftol)
     if ftol is not None:
         fitted = _tempered(objective, minimum, errors, options, ftol)
         if fitted is not minimum:
@@ -307,6 +314,32 @@ def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Arr
         beyond[:] = False
     late = limited(dict(zip(names, value.tolist(), strict=True)))
     return tuple(name for name, over in zip(names, beyond, strict=True) if over or name in late)
+
+
+def _doubting(objective: Objective, minimum: Minimum, errors: _Errors) -> Objective:
+    """Return the objective with a wider prior on the length of link 1 if the motion contradicts it; otherwise itself.
+
+    A length that is far from the true one would otherwise be all that determines the coupling in a small motion, which
+    contradicts it by little more than its own standard error. The prior's variance then becomes the one that makes the
+    contradiction typical.
+    """
+    lever = objective.lever
+    if lever is None or lever.is_doubted:
+        return objective
+    count, x = objective.count, minimum.x
+    away, slope = lever.residual(objective.coordinates.values(x[:count]))
+    along = np.zeros(x.size)
+    along[:count] = slope @ objective.coordinates.slopes(x[:count])
+    normal = minimum.at.normal - np.outer(along, along)
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    inverse = linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True) / np.outer(scale, scale)
+    alone = away - float(along @ inverse @ (minimum.at.gradient - away * along))
+    factor = inflation(minimum.at, errors.scatter, errors.samples, errors.structured, errors.expected)
+    variance = float(factor[[lever.coupling, lever.gravity]].max()) * float(along @ inverse @ along)
+    if alone**2 < LEVER_DOUBTED**2 * (1.0 + variance):
+        return objective
+    wider = lever.std * float(np.sqrt(max(1.0, alone**2 - variance)))
+    return replace(objective, lever=replace(lever, std=wider, is_doubted=True))
 
 
 def _tempered(

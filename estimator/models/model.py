@@ -20,6 +20,10 @@ LEVER_STD = 0.05
 """Relative standard deviation of the quotient of a measured link length and the component of gravity in the plane of
 motion. That component depends on the configured tilt.
 """
+LEVER_DOUBTED = 1.2
+"""Deviation of the motion's own estimate from this prior, in standard deviations of their difference, from which the
+prior is widened.
+"""
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,18 @@ from hil.estimation.torque_constants import contradictions, ratios_of
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.identify import Estimate
 from hil.estimator.models.conflicts import Conflict, conflicts
+from hil.estimator.models.model import LEVER_STD
 from hil.plan.chain_model import torque_constant_stds
 
 DEVIATIONS = 4.0  # standard errors
 LENGTH_TOLERANCE = 0.05  # relative; link lengths are measured with a ruler
 _UPRIGHT = 0.5  # sine of a link's angle above the horizontal
 FLAT = 0.02  # of the largest commanded torque, below which gravity counts as absent
+
+MOSTLY_BORROWED, CLEARLY_WIDER = 0.85, 2.0
+"""Standard error of the length of link 1 that follows from the parameters, relative to that of its prior, from which
+the prior is its main source, and from which it must have been widened (`LEVER_DOUBTED`).
+"""
 
 
 def doubts(
@@ -40,22 +46,56 @@ def wrong_length(length: float | None, gravity: float, estimate: Estimate | Shoo
 
     gravity: gravity in the arm's plane [m/s^2].
     """
-    if length is None or estimate.model.joints != 2 or not gravity:
+    seen = _seen_length(gravity, estimate)
+    if length is None or seen is None:
         return []
-    value = estimate.parameters
-    coupling, weight = value["coupling"], value["gravity_2"]
-    if not coupling or not weight:
-        return []
-    found = coupling * gravity / weight
-    at = [estimate.names.index(name) for name in ("coupling", "gravity_2")]
-    slope = np.array([found / coupling, -found / weight])
-    std = float(np.sqrt(max(0.0, slope @ estimate.covariance[np.ix_(at, at)] @ slope)))
+    found, std = seen
     if not abs(found - length) > max(DEVIATIONS * std, LENGTH_TOLERANCE * length):
         return []
     return [
         f"coupling * gravity / gravity_2 = {found:.3g} +- {std:.1g} m should equal the length of link 1, {length:.3g} "
         "m: arm.gravity, the plane's tilt or that length is wrong, or the model is incomplete."
     ]
+
+
+def _seen_length(gravity: float, estimate: Estimate | ShootingEstimate) -> tuple[float, float] | None:
+    """Length of link 1 that follows from the parameters, with its standard error [m]; None if they do not contain it.
+
+    gravity: gravity in the arm's plane [m/s^2].
+    """
+    if estimate.model.joints != 2 or not gravity:
+        return None
+    value = estimate.parameters
+    coupling, weight = value["coupling"], value["gravity_2"]
+    if not coupling or not weight:
+        return None
+    found = coupling * gravity / weight
+    at = [estimate.names.index(name) for name in ("coupling", "gravity_2")]
+    slope = np.array([found / coupling, -found / weight])
+    return found, float(np.sqrt(max(0.0, slope @ estimate.covariance[np.ix_(at, at)] @ slope)))
+
+
+def borrowed_length(config: Config, estimate: Estimate) -> tuple[str, ...]:
+    """Say so if the coupling is known mainly from `arm.link_lengths`, or if the motion contradicts that length but
+    hardly determines it.
+    """
+    seen = _seen_length(config.arm.gravity, estimate)
+    if estimate.model.lever is None or config.arm.link_lengths is None or seen is None:
+        return ()
+    length, (found, std) = config.arm.link_lengths[0], seen
+    share = std / abs(found) / LEVER_STD
+    if share < MOSTLY_BORROWED:
+        return ()
+    if share > CLEARLY_WIDER:
+        return (
+            f"The motion hardly determines the length of link 1 ({found:.2g} +- {std:.1g} m) and may contradict "
+            f"arm.link_lengths[0] = {length:g} m: measure it again.",
+        )
+    return (
+        f"The motion hardly determines the coupling, which therefore rests on arm.link_lengths[0] = {length:g} m, "
+        f"assumed to be right to within {100 * LEVER_STD:g} %. If that length is wrong, coupling, inertia_2 and "
+        "armature_2 are wrong, too: measure it again.",
+    )
 
 
 def _weight(config: Config, estimate: Estimate, largest_torque: float) -> list[str]:

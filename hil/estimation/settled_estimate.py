@@ -17,7 +17,7 @@ from hil.estimation.drive.supply import supply_notes, supply_sag
 from hil.estimation.model_from_config import lever_of, voltage_driven, wanted_model
 from hil.estimation.physical import physical_of
 from hil.estimation.pilot_limit import torque_limit
-from hil.estimation.plausibility import conflicts_of, doubts
+from hil.estimation.plausibility import borrowed_length, conflicts_of, doubts
 from hil.estimation.result import Checks, make_result
 from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
 from hil.estimation.settled_period import settled_period
@@ -92,7 +92,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     validation = validate(period, estimate, config.arm.gravity > 0.0)
     conflicts = conflicts_of(config, estimate)
     wrong = doubts(config, estimate, float(np.abs(period.torque).max()), conflicts)
-    notes = supply_notes(config, supply_sag(config, samples))
+    notes = (*supply_notes(config, supply_sag(config, samples)), *borrowed_length(config, estimate))
     limit = torque_limit(config, samples)
     evidence = Evidence(
         None if other is None else played[HELD_OUT].error_beyond(other.noise),
