@@ -53,6 +53,7 @@ def dry_run(
     else:
         print_dry_run(rehearsal.config, rehearsal.found, result_console())
     if rehearsal.is_safe and not json_only:
-        print(next_step("identify", config))
+        starts_from = result is not None and rehearsal.config.experiment.pilot and not rehearsal.config.is_chain
+        print(next_step("identify", config, *(("--from", result) if starts_from else ())))
     if not rehearsal.is_safe:
         raise typer.Exit(1)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from hil import __version__
@@ -37,6 +37,7 @@ _DASK: dict[str, Any] = {
 _ADDRESS = re.compile(r"([a-z]+://)?[^\s/]+:\d{1,5}")
 
 _PACKAGES = ("numpy", "scipy", "numba", "distributed")
+_NO_DASK = "hil study needs Dask: pip install 'hil[study]'."
 _CONNECT_S = 10.0
 _MOST_DEATHS = 10
 """Number of worker losses after which a run counts as failed, since a run that needs too much memory kills every worker
@@ -54,7 +55,7 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
         import dask
         from distributed import Client
     except ImportError as error:
-        raise MissingExtra("hil study needs Dask: pip install 'hil[study]'.") from error
+        raise MissingExtra(_NO_DASK) from error
     dask.config.set({**_DASK, "distributed.scheduler.allowed-failures": _MOST_DEATHS})
     _silence()
     wanted = count or engine.workers or os.cpu_count() or 1
@@ -140,7 +141,10 @@ def versions() -> dict[str, str]:
 @cache
 def _package_versions() -> dict[str, str]:
     python = f"{sys.version_info.major}.{sys.version_info.minor}"
-    return {"python": python, **{name: version(name) for name in _PACKAGES}}
+    try:
+        return {"python": python, **{name: version(name) for name in _PACKAGES}}
+    except PackageNotFoundError as error:
+        raise MissingExtra(_NO_DASK) from error
 
 
 def _check_versions(client: "Client", scheduler: str | None) -> None:

@@ -6,13 +6,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("distributed", reason="Dask is not installed: pip install 'hil[study]'")
 
-from hil.errors import ConfigError, RunFolderError, SchedulerLost
+from hil.errors import ConfigError, MissingExtra, RunFolderError, SchedulerLost
+from hil.study import engine
 from hil.study.checks import check_study
 from hil.study.dataset import Dataset
 from hil.study.folder import opened
@@ -225,3 +227,12 @@ def test_a_queue_that_refuses_is_quoted_and_nothing_is_left(tmp_path: Path, queu
 def test_an_address_that_is_none_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="give its address"):
         run_study(study(tmp_path, EMPTY.format(runs=2)), tmp_path / "out", scheduler="somewhere")
+
+
+def test_half_an_extra_is_a_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(engine, "version", gone)
+    with pytest.raises(MissingExtra, match=r"pip install 'hil\[study\]'"):
+        engine._package_versions.__wrapped__()
