@@ -241,23 +241,21 @@ def _drifted(drift: Drift | None, validation: Validation) -> tuple[str, ...]:
     """
     if drift is None:
         return ()
-    if float(validation.residual_over_floor.max()) > MUCH_LEFT:
-        changed = [
-            f"joint {joint + 1} by {100.0 * change:+.2g} %"
-            for joint, (change, std) in enumerate(zip(drift.change.tolist(), drift.std.tolist(), strict=True))
-            if abs(change) > max(LEAST, 3.0 * std)
-        ]
-        if not changed:
-            return ()
+    changed = [
+        (f"joint {joint + 1}", change)
+        for joint, (change, std) in enumerate(zip(drift.change.tolist(), drift.std.tolist(), strict=True))
+        if abs(change) > max(LEAST, 3.0 * std)
+    ]
+    if changed and float(validation.residual_over_floor.max()) > MUCH_LEFT:
         return (
-            f"Friction seems to have changed within {drift.seconds:.0f} s ({', '.join(changed)}), but as long as the "
+            f"Friction seems to have changed within {drift.seconds:.0f} s "
+            f"({', '.join(f'{joint} by {100.0 * change:+.2g} %' for joint, change in changed)}), but as long as the "
             "motion is not explained, the same missing effect may cause this.",
         )
     return tuple(
-        f"Friction of joint {joint + 1} {'fell' if change < 0.0 else 'rose'} by {percent(abs(change))} within "
+        f"Friction of {joint} {'fell' if change < 0.0 else 'rose'} by {percent(abs(change))} within "
         f"{drift.seconds:.0f} s{_reason(change, drift.seconds)}"
-        for joint, (change, std) in enumerate(zip(drift.change.tolist(), drift.std.tolist(), strict=True))
-        if abs(change) > max(LEAST, 3.0 * std)
+        for joint, change in changed
     )
 
 
