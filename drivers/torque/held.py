@@ -65,7 +65,8 @@ def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
     would jerk the arm back up.
     """
     held = [servo for servo in servos.values() if is_held(servo)]
-    goals = [(servo, name, servo.read(name)) for servo in held for name in (_what_drives(servo),)]
+    names = [_what_drives(servo) for servo in held]
+    goals = [(servo, name, servo.read(name)) for servo, name in zip(held, names, strict=True)]
     is_lowered = False
     try:
         for step in range(1, _STEPS + 1):

@@ -17,6 +17,7 @@ from hil.estimator.baselines.idim import InverseDynamics, fit_inverse_dynamics
 from hil.estimator.baselines.kalman import Filter, Filtered, fit_by_kalman
 from hil.estimator.baselines.paper_lines import fit_linearised
 from hil.estimator.baselines.rls import fit_recursively
+from hil.estimator.data.joined_periods import joined
 from hil.estimator.data.recording import Recording
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import EstimationError
@@ -48,19 +49,6 @@ class Peer:
     """The chosen settings, as text."""
     tried: int
     """Number of settings tried."""
-
-
-def joined(period: SettledPeriod, periods: int) -> Recording:
-    """Return the settled period, repeated `periods` times, as a recording with commands held between samples."""
-    count = period.samples * periods
-    return Recording(
-        np.arange(count) / period.rate,
-        np.tile(period.torque, periods),
-        np.tile(period.position, periods),
-        period.position_step,
-        between="held",
-        command_to_sample=period.command_to_sample,
-    )
 
 
 def compare_peers(period: SettledPeriod, length: float | None, gravity: float) -> Iterator[Peer]:

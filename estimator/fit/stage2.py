@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
@@ -30,7 +29,7 @@ from hil.estimator.fit.ripple import WAVES, find_waves
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.fit.stage1 import LinearEstimate
-from hil.estimator.models.bounds import beyond_range, finite_std, matters, step_beyond
+from hil.estimator.models.bounds import beyond_range, finite_std, matters, scaled_inverse, step_beyond
 from hil.estimator.models.model import LEVER_DOUBTED, Model
 from hil.estimator.models.terms import FRICTIONS, term_of
 from hil.estimator.options import LikelihoodOptions
@@ -330,10 +329,9 @@ def _doubting(objective: Objective, minimum: Minimum, errors: _Errors) -> Object
     away, slope = lever.residual(objective.coordinates.values(x[:count]))
     along = np.zeros(x.size)
     along[:count] = slope @ objective.coordinates.slopes(x[:count])
-    normal = minimum.at.normal - np.outer(along, along)
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    inverse = linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True) / np.outer(scale, scale)
-    alone = away - float(along @ inverse @ (minimum.at.gradient - away * along))
+    inverse, scale = scaled_inverse(minimum.at.normal - np.outer(along, along))
+    gradient, along = (minimum.at.gradient - away * along) / scale, along / scale
+    alone = away - float(along @ inverse @ gradient)
     factor = inflation(minimum.at, errors.scatter, errors.samples, errors.structured, errors.expected)
     variance = float(factor[[lever.coupling, lever.gravity]].max()) * float(along @ inverse @ along)
     if alone**2 < LEVER_DOUBTED**2 * (1.0 + variance):

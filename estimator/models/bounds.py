@@ -20,6 +20,17 @@ FAINTEST = 1e-140  # influence of a coordinate below which its square underflows
 MOVED = 1.0  # standard errors by which the bound must shift another parameter for it to count as dependent
 
 
+def scaled_inverse(normal: Array) -> tuple[Array, Array]:
+    """Return the pseudo-inverse of a normal matrix (coordinates, coordinates) in which each coordinate is divided by
+    its own scale, and these scales (coordinates,).
+
+    The scale of a parameter that has run to zero is many orders of magnitude smaller than that of the others.
+    """
+    scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
+    scale = np.where(scale > FAINTEST, scale, 1.0)
+    return linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True), scale
+
+
 def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, Array]:
     """Return the undamped step of the parameters (parameters,) [SI] without bounds, and its standard errors.
 
@@ -27,10 +38,7 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
     (coordinates,): normal matrix and gradient of the sum of squares. slopes: derivatives of the parameters with respect
     to their coordinates, which come first (parameters, parameters).
     """
-    # Each coordinate by its own scale: that of a parameter that has run to zero is many orders of magnitude smaller.
-    scale = np.sqrt(np.diag(normal))
-    scale = np.where(scale > FAINTEST, scale, 1.0)
-    inverse = linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True)
+    inverse, scale = scaled_inverse(normal)
     count = len(slopes)
     step = -(inverse @ (gradient / scale))[:count] / scale[:count]
     covariance = (inverse / np.outer(scale, scale))[:count, :count]

@@ -42,15 +42,14 @@ def _leaning(config: Config) -> Iterator[str]:
     """Yield a warning if a planar arm's links neither hang nor stand at rest: something must hold them there."""
     if config.arm.gravity == 0.0 or config.stabiliser is not None:
         return
-    angles = list(accumulate(config.arm.rest_pose))
-    leaning = [
-        (joint, angle) for joint, angle in zip(config.joints, angles, strict=True) if abs(math.cos(angle)) > _LEANS
-    ]
-    if not leaning:
+    angles = zip(config.joints, accumulate(config.arm.rest_pose), strict=True)
+    leaning = next(((joint, angle) for joint, angle in angles if abs(math.cos(angle)) > _LEANS), None)
+    if leaning is None:
         return
-    joint, angle = leaning[0]
+    joint, angle = leaning
+    away = abs(math.degrees(math.remainder(angle + math.pi / 2, math.tau)))
     yield (
-        f"At arm.rest_pose, the link of joint {joint.name!r} is {abs(math.degrees(angle + math.pi / 2)) % 360:.0f} "
+        f"At arm.rest_pose, the link of joint {joint.name!r} is {away:.0f} "
         "degrees away from hanging straight down, so without torque only friction or a stop holds it there. A planar "
         "arm's stops are not part of its model: if it rests against one, change the mounting so that it hangs freely, "
         "or describe the arm by a URDF, whose joints may rest against their stops."

@@ -3,6 +3,7 @@
 import logging
 import time
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +27,7 @@ from hil.estimation.slips.position_jumps import jump_disturbances
 from hil.estimation.slips.rest_shift import rest_shift_warnings
 from hil.estimation.unsettled.causes import stop_in
 from hil.estimator.arrays import Array
-from hil.estimator.data.recording import Recording
+from hil.estimator.data.joined_periods import joined
 from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import RecordingError
@@ -136,16 +137,11 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
 
 def _cause(config: Config, period: SettledPeriod, validation: Validation) -> str:
     """Return a cause of an unexplained motion: a rate that beats with the servos, or a stop; "" if none is known."""
-    if float(validation.residual_over_floor.max()) <= MUCH_LEFT:
-        return varying_delay(config)
-    when = np.arange(period.samples) / period.rate
-    try:
-        recording = Recording(
-            when, period.torque, period.position, period.position_step, "held", period.command_to_sample
-        )
-    except RecordingError:  # a joint that hardly moved
-        return varying_delay(config)
-    return " ".join(said for said in (varying_delay(config), stop_in([recording])) if said)
+    said = [varying_delay(config)]
+    if float(validation.residual_over_floor.max()) > MUCH_LEFT:
+        with suppress(RecordingError):  # a joint that hardly moved
+            said.append(stop_in([joined(period, 1)]))
+    return " ".join(filter(None, said))
 
 
 def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tuple[SettledPeriod | None, list[str]]:

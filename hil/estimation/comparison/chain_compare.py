@@ -10,13 +10,14 @@ from hil.errors import ConfigError
 from hil.estimation.chain_estimate import true_chain_parameters, wanted_chain_model
 from hil.estimation.settled_period import settled_period
 from hil.estimator.arrays import Array
-from hil.estimator.baselines.compare import Peer, joined
+from hil.estimator.baselines.compare import Peer
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.fit.regression import fit_filtered
 from hil.estimator.chain.fit.stage1 import COULOMB_WIDTH, fit_lines
 from hil.estimator.chain.identify import identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.simulation.prediction import predict
+from hil.estimator.data.joined_periods import joined
 from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import EstimationError

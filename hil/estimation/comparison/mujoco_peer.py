@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.errors import MissingExtra
-from hil.estimator.baselines.compare import Peer, joined
+from hil.estimator.baselines.compare import Peer
+from hil.estimator.data.joined_periods import joined
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.stage1 import LinearEstimate, fit_lines
 
