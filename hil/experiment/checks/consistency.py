@@ -146,7 +146,7 @@ MEMORY = np.dtype(
         *((name, "f8") for name in ("position", "velocity", "unsure")),
         *((name, "f8") for name in ("seconds", "moved", "difference", "unknown", "most_curved")),
         *((name, "f8") for name in ("turn", "seen", "headed", "heading", "moving")),
-        *((name, "f8") for name in ("rough", "roughness")),
+        *((name, "f8") for name in ("behind", "rough", "roughness")),
         *((name, "f8") for name in ("learnt", "lag", "scale")),
         *bias.FIELDS,
         ("lags", lag.LAGS),
@@ -162,7 +162,8 @@ MEMORY = np.dtype(
 position, velocity, turn: latest values, and latest change of velocity [rad, rad/s]; the position is NaN before the
 first one and after a long gap. unsure: uncertainty of the time of the latest measurement [s]. seconds, moved,
 difference, unknown: sums since the long memory was last updated; most_curved: the maximum since then. seen:
-`difference`, except for motion that is too slow for the velocity register. headed: time of motion in the positive
+`difference`, except for motion that is too slow for the velocity register; behind: position minus that of a
+reference that follows such motion [rad]. headed: time of motion in the positive
 direction minus time of motion in the negative direction, since the same update [s]. rough: sum of squares of the errors
 that velocity jumps may have caused since then [rad^2]. heading, roughness, moving: what the slow memory holds of
 `headed`, `rough` and the time in motion [s]. learnt: information from which lag and scale error were estimated
@@ -192,7 +193,7 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
         _restart(memory.long, velocity, unknown)
         _restart(memory.slow, velocity, unknown)
         memory.turn = memory.heading = memory.roughness = 0.0
-        memory.moving = 0.0
+        memory.moving = memory.behind = 0.0
         _forget_sums(memory)
         _begin_same(memory.same)
         _forget_block(memory.lags)
@@ -227,8 +228,9 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
     if heads != 0.0:
         memory.headed += seconds if heads > 0.0 else -seconds
         memory.moving += seconds
-        # A joint that seems to stand still may turn by less than one step of the velocity.
-    memory.seen += difference if heads != 0.0 or abs(moved) > RESOLUTION_RAD_S * seconds + STEP_RAD else 0.0
+        memory.seen += difference
+    else:
+        memory.seen += _moved_at_rest(memory, moved, seconds)
     memory.unknown += unknown
     memory.most_curved = max(memory.most_curved, curved)
     memory.seconds += seconds
@@ -315,6 +317,20 @@ def _creeps(memory: Any, velocity: float, unsure: float) -> bool:
     known = BIAS_LAG_SHARE * abs(lags.lag) * slow.span + lag_error * abs(of_lag) + scale_error * abs(slow.far)
     errors = max(NOISE_RAD, NOISE_TIMES * lags.noise) + known + slow.curved + memory.unknown + unsure
     return bool(_look_at_bias(memory, slow.apart - lags.lag * of_lag - lags.scale * slow.far, errors, memory.moving))
+
+
+def _moved_at_rest(memory: Any, moved: float, seconds: float) -> float:
+    """Process an interval in which the velocity reads zero; return the motion that contradicts this [rad].
+
+    A reference follows the position at up to one step of the velocity, and never lags behind by more than `STEP_RAD`.
+    What it has to jump for this is returned. In contrast to a sum of large changes of position, encoder noise, which
+    returns to its mean, does not accumulate in it.
+    """
+    slow = RESOLUTION_RAD_S * seconds
+    behind = memory.behind + moved
+    behind -= min(max(behind, -slow), slow)
+    memory.behind = min(max(behind, -STEP_RAD), STEP_RAD)
+    return float(behind - memory.behind)
 
 
 def _forget_sums(memory: Any) -> None:
@@ -434,6 +450,6 @@ _restart, _add, _is_wrong, _has_jumped, _forget_sums, _begin_same, _is_frozen = 
 )
 NOISE_RAD, NOISE_TIMES, _look_at_bias, _unexplained = bias.NOISE_RAD, bias.NOISE_TIMES, bias.look, bias.unexplained
 _add_to_lags, _forget_block = lag.add, lag.forget
-_creeps = embedded(_creeps)
+_creeps, _moved_at_rest = map(embedded, (_creeps, _moved_at_rest))
 _looks_long, _learn = map(embedded, (_looks_long, _learn))
 look, lost = map(inner, (look, lost))

@@ -25,26 +25,9 @@ from hil.experiment.checks.consistency import (
 )
 from hil.experiment.velocity.lag import ALL_INFORMATION, BLOCK_S, ENOUGH_INFORMATION, LASTS_S, NOISE_RAD
 from tests.support.one_joint import Consistency
+from tests.support.readings import STEP, TICK, learnt_motion, quantised, seen_after
 
 RATES = (20, 100, 400, 1000)
-STEP = math.tau / 4096
-TICK = 0.229 * math.tau / 60
-
-
-def quantised(value: float, step: float) -> float:
-    return round(value / step) * step
-
-
-def seen_after(
-    rate: int, position: Callable[[float], float], velocity: Callable[[float], float], start: float = 0.0
-) -> float:
-    """Time of detection [s]; infinite if nothing is detected within six seconds."""
-    look = Consistency()
-    for index in range(6 * rate):
-        now = start + index / rate
-        if look.look(quantised(position(now), STEP), quantised(velocity(now), TICK), 1 / rate):
-            return now
-    return math.inf
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -190,15 +173,6 @@ def test_after_a_lost_reply_it_begins_anew() -> None:
         assert not look.look(9.0 + 0.01 * (index + 1), 4.0, 0.0025)
 
 
-def learnt_motion(now: float) -> tuple[float, float]:
-    """Position and velocity of a swinging joint whose servo filters the velocity with a lag of 5 ms."""
-    late = now - 0.005
-    return (
-        0.4 * math.sin(math.tau * now) + 0.2 * math.sin(5.3 * now),
-        0.4 * math.tau * math.cos(math.tau * late) + 0.2 * 5.3 * math.cos(5.3 * late),
-    )
-
-
 @pytest.mark.parametrize("rate", [100, 400, 1000])
 @pytest.mark.parametrize(("speed", "most"), [(0.25, 0.4), (-0.25, 0.5), (1.0, 0.12), (0.1, 2.0)])
 def test_a_position_that_creeps_is_seen_before_it_is_far_off(rate: int, speed: float, most: float) -> None:
@@ -305,46 +279,6 @@ def test_lag_and_scale_error_that_a_servo_always_had_are_accepted(lag: float, sc
         return (1.0 + scale) * (0.4 * math.tau * math.cos(math.tau * late) + 0.2 * 5.3 * math.cos(5.3 * late))
 
     assert seen_after(400, lambda now: learnt_motion(now)[0], velocity) == math.inf
-
-
-@pytest.mark.parametrize("rate", [100, 400, 1000])
-@pytest.mark.parametrize("bit", [3, 4, 6])
-def test_a_stuck_bit_is_seen_though_its_jumps_cancel(rate: int, bit: int) -> None:
-    def position(now: float) -> float:
-        ticks = round(learnt_motion(now)[0] / STEP)
-        return STEP * (ticks if now < 3.0 else ticks | 1 << bit)
-
-    when = seen_after(rate, position, lambda now: learnt_motion(now)[1])
-    assert 3.0 <= when < 3.6
-
-
-@pytest.mark.parametrize("noise", [0.7, 2.0, 5.0])
-def test_a_noisy_encoder_and_single_glitches_are_no_stuck_bit(noise: float) -> None:
-    random = Random(noise)
-    glitches = {400 * second for second in range(1, 6)}
-
-    def position(now: float) -> float:
-        glitch = 0.02 if round(400 * now) in glitches else 0.0
-        return learnt_motion(now)[0] + glitch + random.gauss(0.0, noise * STEP)
-
-    assert seen_after(400, position, lambda now: learnt_motion(now)[1]) == math.inf
-
-
-def test_a_creep_slower_than_a_tick_of_velocity_is_taken_for_rounding() -> None:
-    assert seen_after(400, lambda now: 0.03 * now, lambda now: 0.0) == math.inf
-
-
-@pytest.mark.parametrize(("jumps", "seen"), [((0.4, 0.5, 0.6), False), ((0.4, 0.5, 0.6, 0.7), True)])
-def test_four_jumps_are_too_many(jumps: tuple[float, ...], seen: bool) -> None:
-    """Back and forth, so that nothing accumulates; each pair of steps is one jump, the return being half of the
-    next.
-    """
-    times = [round(400 * jump) for jump in jumps]
-
-    def position(now: float) -> float:
-        return 0.012 * (sum(round(400 * now) >= each for each in times) % 2)
-
-    assert (seen_after(400, position, lambda now: 0.0) < math.inf) is seen
 
 
 class _Reference:
