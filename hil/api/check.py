@@ -1,13 +1,19 @@
 """`hil.check`: find everything that would prevent an experiment, before it starts."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hil.api.configuration import ConfigLike, loaded
 from hil.api.progress import OnProgress, Progress, forgiving, ignore
+from hil.config.schema import Config
+from hil.errors import ConfigError
 from hil.results.display import html_table
 from hil.setup.preflight import Finding, Level, check_arm
+
+_ALWAYS_HELD_HZ = 150.0
+"""Rate [Hz] from which on the delay of a stabiliser is not checked, because loading the pilot takes a second."""
 
 __all__ = ["CheckReport", "Finding", "Level", "check"]
 
@@ -72,4 +78,19 @@ def check(config: ConfigLike, *, on_progress: OnProgress = ignore) -> CheckRepor
     """
     checked, shown = loaded(config)
     forgiving(on_progress)(Progress("check", "Checking the arm"))
-    return CheckReport(shown, tuple(check_arm(checked)))
+    return CheckReport(shown, (*check_arm(checked), *_held_by_pilot(checked)))
+
+
+def _held_by_pilot(config: Config) -> Iterator[Finding]:
+    """Report whether the rate is too low for the stabiliser that the pilot of a planar arm would add."""
+    is_doubtful = config.experiment.pilot and config.stabiliser is None and config.experiment.rate < _ALWAYS_HELD_HZ
+    if config.is_chain or config.arm.link_lengths is None or not is_doubtful:
+        return
+    from hil.pilot.belief import prior_belief
+    from hil.pilot.gains import with_stabiliser
+    from hil.pilot.options import PilotOptions
+
+    try:
+        with_stabiliser(config, prior_belief(config, PilotOptions().arms))
+    except ConfigError as error:
+        yield Finding(Level.STOP, "experiment", "rate", f"{config.experiment.rate:g} Hz", str(error))

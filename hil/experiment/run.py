@@ -336,8 +336,8 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if wire > 1 / rate:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms of wire time alone at "
-            f"{bus.port.baud} baud, which allows at most {floor(1 / wire)} Hz. Lower the rate (`hil check` measures "
-            "what is possible), or raise the baud rate with `hil setup`."
+            f"{bus.port.baud} baud, so it must be below {floor(1 / wire)} Hz, and the adapter needs time, too. "
+            "Set it to what `hil check` measures, or raise the baud rate with `hil setup`."
         )
     slowest = bus.port.latency + wire
     if slowest <= 1 / rate:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hil import fakes
+from hil.api.check import check
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import CHECK_S, ServoBus
 from hil.errors import Cause, ConfigError, SafetyStop, StopRequested
@@ -161,3 +162,17 @@ def test_a_rate_too_slow_for_the_stabiliser_is_refused_with_the_one_that_suffice
     assert [each.level for each in found] == [Level.STOP]
     enough = config.model_copy(update={"experiment": config.experiment.model_copy(update={"rate": 45.0})})
     assert too_slow(enough) == ""
+
+
+@pytest.mark.parametrize(("rate", "wanted"), [(20.0, True), (100.0, False)])
+def test_check_refuses_a_rate_at_which_the_pilot_cannot_balance_the_arm(
+    tmp_path: Path, rate: float, wanted: bool
+) -> None:
+    text = (CONFIGS / "first_time.toml").read_text(encoding="utf-8")
+    upright = ("zero_ticks = 3072  ", "zero_ticks = 1024  "), ("[-4.2, 1.06]", "[0.4, 2.7]"), ("[-1.57", "[1.57")
+    path = tmp_path / "arm.toml"
+    slow = (("rate = 400.0", f"rate = {rate}"), ("band = [0.1, 5.0]", "band = [0.1, 4.0]"))
+    path.write_text(replaced(text, *upright, *slow), encoding="utf-8")
+    found = [each for each in check(path).problems if each.what == "rate"]
+    assert [each.where for each in found] == ["experiment"] * wanted
+    assert all("rate = 20 is too low to hold joint 'shoulder'" in each.fix for each in found)
