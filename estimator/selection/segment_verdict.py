@@ -25,6 +25,7 @@ from hil.estimator.selection.verdict import (
 )
 
 NEARLY_EXPLAINED = 1.5  # ratio of residual to noise up to which undetermined friction near standstill does no harm
+EXPLAINED_PREDICTION = 0.15  # prediction error above which even a nearly explained motion is not trusted
 UNDETERMINED = 10.0  # standard error over value above which a parameter is not determined at all
 LITTLE_TORQUE = 0.1  # fraction of the RMS torque; gravity torques below this are negligible
 IMPROVEMENT = {
@@ -133,8 +134,17 @@ def _rules(left: float, held_out: Array | None, weakest: str, part: float, uncle
 
 
 def _is_refused(left: float, held_out: Array | None, evidence: SegmentEvidence) -> bool:
-    beyond = left > MUCH_LEFT if held_out is None else not float(held_out.max()) <= USABLE_PREDICTION
+    beyond = left > MUCH_LEFT if held_out is None else not float(held_out.max()) <= _largest_error(left)
     return evidence.faulty or beyond
+
+
+def _largest_error(left: float) -> float:
+    """Return the largest usable prediction error, relative to the motion's RMS. left: residual over noise.
+
+    If the residual is hardly more than the noise, half of a recording with little motion merely determines the
+    parameters less well than all of it.
+    """
+    return EXPLAINED_PREDICTION if left <= NEARLY_EXPLAINED else USABLE_PREDICTION
 
 
 def _refused(left: float, held_out: Array | None, evidence: SegmentEvidence) -> tuple[str, ...]:
@@ -145,7 +155,7 @@ def _refused(left: float, held_out: Array | None, evidence: SegmentEvidence) -> 
     if held_out is None:
         rule = f"Without that check, a residual above {MUCH_LEFT:g} times the noise"
     else:
-        rule = f"An error above {percent(USABLE_PREDICTION)}"
+        rule = f"An error above {percent(_largest_error(left))}"
     return (f'{rule} makes the verdict "no"{remedy}.',)
 
 

@@ -15,7 +15,7 @@ from hil.recordings.clean import Rows, cleaned
 from hil.recordings.encoder import encoder_step
 from hil.recordings.guess import guessed, said
 from hil.recordings.missing_codes import without_codes
-from hil.recordings.plausible import refuse_degrees
+from hil.recordings.plausible import refuse_degrees, refuse_thousandths
 from hil.recordings.table import Table
 from hil.recordings.units import UNITS, unit_of, wrapped
 from hil.recordings.velocity import contradict, rates
@@ -145,6 +145,8 @@ def _torque(table: Table, columns: Columns, joint: int, notes: list[str]) -> Val
     assert kind is not None
     name = getattr(columns, kind)[joint]
     values = _quantity(table, name, kind, getattr(columns, f"{kind}_unit"), notes=notes)
+    if table.find(name)[2] is None and getattr(columns, f"{kind}_unit") is None:
+        refuse_thousandths(table.source, name, kind, values)
     if kind == "pwm":
         assert columns.supply_voltage is not None
         if float(np.nanmax(np.abs(values), initial=0.0)) > 1.5:

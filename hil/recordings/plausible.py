@@ -1,6 +1,7 @@
-"""Rejection of angles that no servo arm reaches: most often, they are in degrees but not declared as such.
+"""Rejection of angles, torques, currents and voltages that no servo arm reaches: most often, their unit is not stated.
 
-Joints that rotate continuously are accepted, and so is everything if [columns] states the unit.
+Joints that rotate continuously are accepted, and so is everything if [columns] states the unit. A torque, current or
+voltage is also accepted if its column states the unit.
 """
 
 import math
@@ -17,6 +18,11 @@ MOST_RANGE_RAD = 4 * math.pi
 
 TIMES_NO_LOAD = 5.0
 """Highest plausible speed, relative to the no-load speed of the fastest servo."""
+
+MOST_DRIVE = {"torque": (60.0, "N m", "mN m"), "current": (40.0, "A", "mA"), "voltage": (60.0, "V", "mV")}
+"""Largest plausible value of each kind of drive command, its SI unit, and the unit that is usual for larger numbers.
+The largest servos (PH54) deliver 45 N m continuously and are supplied with 24 V.
+"""
 
 _ONE_WAY = 0.7
 """A joint counts as rotating continuously if at least this fraction of its path is in one direction."""
@@ -54,6 +60,24 @@ def refuse_degrees(source: str, names: Sequence[str], time: Array, position: Arr
             f'the unit in the column\'s header; if the header has none, set position_unit = "{key}"{turn} in [columns] '
             'of --config ARM.toml (in Python: config="ARM.toml"). If it is in rad, set position_unit = "rad" there. '
             "Check the unit of time, too."
+        )
+
+
+def refuse_thousandths(source: str, name: str, kind: str, values: Array) -> None:
+    """Raise CsvError if `values` (samples,) of a column without a unit are too large for the SI unit.
+
+    kind: a key of `MOST_DRIVE`; others are accepted.
+    """
+    if kind not in MOST_DRIVE:
+        return
+    limit, unit, other = MOST_DRIVE[kind]
+    most = float(np.nanmax(np.abs(values), initial=0.0))
+    if most > limit:
+        raise CsvError(
+            f"{source}: column {name!r} states no unit and reaches {most:.4g}, which would be {most:.4g} {unit}: more "
+            f"than any servo. Is it in {other}? Then append [{other}] to the column's name, or set "
+            f'{kind}_unit = "{other}" in [columns] of --config ARM.toml (in Python: config="ARM.toml"). If it is in '
+            f'{unit}, set {kind}_unit = "{unit}" there.'
         )
 
 

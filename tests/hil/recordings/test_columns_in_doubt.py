@@ -166,3 +166,28 @@ def test_link_lengths_are_checked(lengths: str, said: str, tmp_path: Path) -> No
 @pytest.mark.parametrize("unit", ["mNm", "mN m", "mN*m"])
 def test_a_torque_unit_needs_no_space(unit: str) -> None:
     assert Columns.model_validate({"torque_unit": unit}).torque_unit == "mN m"
+
+
+@pytest.mark.parametrize(
+    ("head", "keys", "size", "said"),
+    [
+        ("tau", {}, 300.0, "would be 300 N m: more than any servo. Is it in mN m? Then append [mN m]"),
+        ("tau", {}, 50.0, ""),
+        ("tau [N m]", {}, 300.0, ""),
+        ("tau [mN m]", {}, 300.0, ""),
+        ("tau", {"torque_unit": "N m"}, 300.0, ""),
+        ("current", {"torque_constant": [1.8]}, 700.0, "reaches 700, which would be 700 A: more than any servo. Is it"),
+        ("current [mA]", {"torque_constant": [1.8]}, 700.0, ""),
+    ],
+)
+def test_a_torque_or_current_without_a_unit_that_no_servo_has_is_refused(
+    head: str, keys: dict[str, Any], size: float, said: str
+) -> None:
+    read = table(q=rounded(1.0), **{head: size * np.sin(TIME)})
+    columns = Columns(time="t", position=["q"], **keys)
+    if not said:
+        assert convert(read, columns).recordings
+        return
+    with pytest.raises(CsvError) as error:
+        convert(read, columns)
+    assert said in str(error.value)
