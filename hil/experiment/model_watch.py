@@ -68,12 +68,19 @@ _LAG_S = 0.012
 """Time constant with which a torque step appears in the velocity [s], due to current loop and velocity filter."""
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
-JOLT_S, JOLT_BACK_S = 0.01, 0.15
-"""Times within which a slipping joint's velocity changes, and changes back [s]."""
+JOLT_S, JOLT_BACK_S = 0.01, 0.08
+"""Times within which a slipping joint's velocity changes, and changes back [s]; at rates below some 40 Hz, the latter
+is three sample intervals.
+"""
 
 JOLT_RAD_S, JOLT_TIMES = 1.2, 5.0
 """Smallest change of velocity in `JOLT_S` that counts as a jolt [rad/s], and its smallest ratio to the RMS of ordinary
 changes.
+"""
+
+IMPACT_TIMES, IMPACT_S = 1.5, 10.0
+"""Smallest ratio of a jolt to the largest earlier change of velocity that was not followed by one back, and the time
+constant with which that is forgotten [s].
 """
 
 PLAY_RAD, CURVED = 0.015, 0.2
@@ -89,19 +96,20 @@ _WINDOW_S = 0.3
 
 
 JOLT = np.dtype(
-    [(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun")]
+    [(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun", "impact")]
     + [("count", "i8"), ("oldest", "i8"), ("reversed", "i8")]
 )
 """Statistics of a joint's changes of velocity; initially zero, except `begun`, which is minus infinity.
 
 square: mean square of ordinary changes [rad^2/s^2], over age [s]. squared, since: integral of the squared changes that
 are not yet included because they may belong to a jolt, and the time that it covers [s]. change: first change of a
-possible jolt [rad/s]. begun: time of that change [s]. count, oldest: number of earlier velocities stored, and the row
+possible jolt [rad/s]. begun: time of that change [s]. impact: the largest change of velocity so far that was not part
+of a jolt, fading [rad/s]. count, oldest: number of earlier velocities stored, and the row
 of the oldest. reversed: whether the joint reversed in the first change of a possible jolt.
 """
 
 
-def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float, least: float) -> int:
+def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float, least: float, longest: float) -> int:
     """Process velocities [rad/s], `seconds` after the previous ones [s]; return a joint whose velocity jumped and
     jumped back a moment later, as when its horn slips; -1 if there is none.
 
@@ -109,10 +117,12 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
     therefore needs no knowledge of the arm. Changes of velocity over `JOLT_S` are compared with ordinary ones.
 
     If the joint reverses in both changes, the motor has crossed the backlash of its gear twice in succession, which it
-    does much faster than it can move the arm. This is not a jolt.
+    does much faster than it can move the arm. This is not a jolt. In a gear with much play, a tooth that meets the
+    other flank changes the velocity without a reversal, too. By chance, two such impacts may look like a jolt. Single
+    ones are much more frequent, so a jolt must exceed the largest of them.
 
     joints: records of type JOLT. former: the latest velocities (samples within `JOLT_S`, joints) [rad/s]. least:
-    smallest change that counts as a jolt [rad/s].
+    smallest change that counts as a jolt [rad/s]. longest: time within which the velocity jumps back [s].
     """
     back = former.shape[0]
     found = -1
@@ -125,9 +135,10 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
         if joint.count < back:
             joint.count += 1
             continue
-        most = max(least, JOLT_TIMES * math.sqrt(joint.square))
+        joint.impact -= min(1.0, seconds / IMPACT_S) * joint.impact
+        most = max(least, JOLT_TIMES * math.sqrt(joint.square), IMPACT_TIMES * joint.impact)
         is_jolt = not -most <= change <= most
-        is_open = now - joint.begun <= JOLT_BACK_S
+        is_open = now - joint.begun <= longest
         turned_round = velocity[index] * (velocity[index] - change) < 0.0
         if is_jolt and is_open and change * joint.change < 0.0:
             if not (turned_round and joint.reversed):
@@ -135,6 +146,7 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
                 continue
             is_open = False
         if is_jolt and not is_open:
+            joint.impact = max(joint.impact, abs(joint.change) * math.exp((joint.begun - now) / IMPACT_S))
             joint.begun, joint.change, joint.reversed, is_open = now, change, turned_round, True
         # A possible beginning of a jolt only counts as ordinary motion once it has turned out not to be one.
         joint.squared += seconds * min(change * change, most * most)
@@ -151,7 +163,7 @@ _jolting = inner(_jolting)
 
 
 _TIMES = np.dtype(
-    [(name, "f8") for name in ("seen_at", "shortest", "seconds", "vague", "longest_gap", "follows", "least")]
+    [(name, "f8") for name in ("seen_at", "shortest", "seconds", "vague", "longest_gap", "follows", "least", "jolts_s")]
 )
 """Quantities that depend on the times of the samples.
 
@@ -159,7 +171,7 @@ seen_at, seconds: time of the latest sample, and time since the previous one [s]
 between is not judged. shortest: duration of the shortest exchange [s]. vague: largest excess over this at which the
 time of a measurement counts as known [s]. longest_gap: largest `seconds` over which changes of velocity are judged [s].
 follows: fraction of a torque step that the motor has followed by the next sample. least: smallest change of velocity
-that counts as a jolt [rad/s].
+that counts as a jolt [rad/s]. jolts_s: longest duration of a jolt [s].
 """
 
 _DRIVE = np.dtype([(name, "f8") for name in ("constant", "goal", "felt")])
@@ -209,10 +221,15 @@ def _watch_loop(
     if seconds > at.longest_gap:
         for index in range(len(jolts)):
             jolts[index].count = 0
-    jolted = _jolting(jolts, velocities, (v1, v2), seconds, before, at.least)
+    jolted = _jolting(jolts, velocities, (v1, v2), seconds, before, at.least, at.jolts_s)
     second = drives[1].felt if len(drives) > 1 else 0.0
     unlike = observe(m, rests, past, k, q1, q2, v1, v2, drives[0].felt, second, seconds)
     return int(_JOLTED * (jolted + 1) + unlike + 1)
+
+
+def jolt_back_s(interval: float) -> float:
+    """Return the time within which a slipping joint's velocity changes back [s]. interval: between samples [s]."""
+    return max(JOLT_BACK_S, 3.0 * interval)
 
 
 Explain = Callable[[int, float, Sequence[State]], None]
@@ -263,6 +280,7 @@ class ModelWatch:
         self._times["vague"], self._times["longest_gap"] = self._long, _GAP * interval
         self._times["follows"] = 1.0 - math.exp(-interval / _LAG_S) if self._is_held else 1.0
         self._times["least"] = JOLT_RAD_S * max(1.0, interval / JOLT_S)
+        self._times["jolts_s"] = jolt_back_s(interval)
         drives = np.zeros(len(largest), _DRIVE)
         drives["constant"], drives["goal"] = self._constants, np.nan
         velocities = np.zeros((back, len(largest)))
@@ -310,9 +328,10 @@ class ModelWatch:
             displaced = abs(state.position[joint] - before.position[joint] - expected)
             if displaced <= PLAY_RAD + CURVED * seconds * math.sqrt(float(jolt["square"])):
                 return
+        longest = float(self._times["jolts_s"][0])
         raise SafetyStop(
             f"{self._names[joint]} jerked: its velocity changed by {jolt['change']:+.1f} rad/s and back within "
-            f"{1e3 * JOLT_BACK_S:.0f} ms, which the commanded torques cannot cause. Its horn slips on the shaft, its "
+            f"{1e3 * longest:.0f} ms, which the commanded torques cannot cause. Its horn slips on the shaft, its "
             "gear is worn, something hit it, its encoder is wrong, or another program sent it a goal.",
             Cause.UNEXPECTED,
         )

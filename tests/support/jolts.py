@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hil.experiment.model_watch import JOLT, JOLT_RAD_S, JOLT_S, _jolting
+from hil.experiment.model_watch import JOLT, JOLT_RAD_S, JOLT_S, _jolting, jolt_back_s
 
 
 class Jolts:
@@ -12,6 +12,7 @@ class Jolts:
 
     def __init__(self, count: int, interval: float) -> None:
         self._least = JOLT_RAD_S * max(1.0, interval / JOLT_S)
+        self._longest = jolt_back_s(interval)
         self._joints = np.zeros(count, JOLT)
         self._joints["begun"] = -np.inf
         self._former = np.zeros((max(1, round(JOLT_S / interval)), count))
@@ -20,7 +21,7 @@ class Jolts:
         """Process velocities [rad/s], `seconds` after the previous ones [s]; return the joint that jolted and its
         change of velocity [rad/s], or None.
         """
-        joint = _jolting(self._joints, self._former, tuple(velocity), seconds, now, self._least)
+        joint = _jolting(self._joints, self._former, tuple(velocity), seconds, now, self._least, self._longest)
         return None if joint < 0 else (joint, float(self._joints["change"][joint]))
 
     def forget(self) -> None:

@@ -239,8 +239,17 @@ def test_teeth_that_change_sides_at_two_reversals_are_no_jolt() -> None:
     """A motor crosses the gap of its gear at both: velocities as measured on an arm with 9 mrad of play, at 100 Hz."""
     between = [-0.72, -1.03, -1.17, -1.22, -1.2, -1.05, -0.84, -0.58, -0.26]
     assert jolt([0.5] * 40 + [0.14, -1.25, *between, 0.95, 1.1, 1.3]) is None
-    assert jolt([0.5] * 40 + [1.9] * 8 + [0.5] * 20) is not None, "no reversal"
-    assert jolt([0.5] * 40 + [-1.25] * 4 + [-1.0, -0.6, -0.3, -0.1] + [-1.5] + [0.0] * 20) is not None, "one reversal"
+    assert jolt([0.5] * 40 + [1.9] * 6 + [0.5] * 20) is not None, "no reversal"
+    assert jolt([0.5] * 40 + [-1.25] * 2 + [-1.0, -0.6, -0.3, -0.1] + [-1.5] + [0.0] * 20) is not None, "one reversal"
+
+
+@pytest.mark.parametrize(("jump", "later", "seen"), [(2.5, 1.0, False), (3.5, 1.0, True), (2.5, 12.0, True)])
+def test_a_jolt_is_larger_than_single_impacts_before_it(jump: float, later: float, seen: bool) -> None:
+    """A gear with much play: each tooth that meets the other flank changes the velocity, and two may follow each other
+    by chance, as on an XM540 with 0.5 degrees of play.
+    """
+    velocities = [3.0] * 40 + [5.0] * round(100 * later) + [5.0 - jump] * 5 + [5.0] * 20
+    assert (jolt(velocities) is not None) is seen
 
 
 def test_a_jolt_is_large_compared_with_the_usual_changes() -> None:

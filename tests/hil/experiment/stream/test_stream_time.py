@@ -81,7 +81,7 @@ def test_a_safety_stop_carries_the_sample_that_passed_the_limit(arm: Arm, tmp_pa
 
 def test_a_rate_that_the_wire_cannot_carry_is_refused_before_torque(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
     config = arm(("rate = 400.0", "rate = 1200.0"))
-    with pytest.raises(WrongSetting, match=r"1200: the longest exchange takes 0\.9\d ms .* at most 10\d\d Hz"):
+    with pytest.raises(WrongSetting, match=r"1200: the longest exchange takes 0\.9\d ms .* must be below 10\d\d Hz"):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None)
     assert not any(servo.torque_enabled for servo in ports[0].bus.servos.values())
 
