@@ -28,6 +28,7 @@ from hil.experiment.checks.joint_checks import JOINT, MOST_OUTSIDE_RAD, JointChe
 from hil.experiment.checks.joint_faults import JointFaults
 from hil.experiment.command_limits import CommandLimits
 from hil.experiment.deadlines import Deadlines
+from hil.experiment.held_at_rest import HeldAtRest
 from hil.experiment.silence import LATE_WAKE_UP_S, Silence
 from hil.experiment.status_check import OLD_REPLIES, TORQUE_LOST, StatusCheck
 from hil.plan.find_torque import how_to_find_torque
@@ -124,6 +125,8 @@ class Guard:
         self._was_irregular = False
         """Whether replies were missing or reported an error in the previous exchange."""
         self._resting: Sequence[float] | None = None
+        self._held: HeldAtRest | None = None
+        self._config = config
         self._shortest = float("inf")
 
     def woke_up(self, now: float, late: float) -> None:
@@ -271,6 +274,15 @@ class Guard:
                     f"moved before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
                     f"is allowed. {self._still_swings()} {self._else_moved(state.velocity[index])}",
                 )
+
+    def look_while_held(self, state: State) -> None:
+        """Raise SafetyStop when a joint leaves its rest pose although only the stabiliser drives it."""
+        if self._held is None:
+            if not any(state.missing):
+                self._held = HeldAtRest(self._config, self._resting or state.position)
+        elif not any(state.missing) and (found := self._held.look(state.position)) is not None:
+            index, said = found
+            self._stop(index, Cause.EARLY_MOTION, said)
 
     def _else_moved(self, velocity: float) -> str:
         """Return what, other than swinging, may have moved a joint before the start; velocity: its velocity [rad/s]."""

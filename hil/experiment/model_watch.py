@@ -83,9 +83,10 @@ IMPACT_TIMES, IMPACT_S = 1.5, 10.0
 constant with which that is forgotten [s].
 """
 
-PLAY_RAD, CURVED = 0.015, 0.2
-"""Displacement within a jolt that gear backlash may cause [rad], twice the backlash in a servo's data sheet; and
-allowance for the curvature of ordinary motion, as a fraction of the usual change of velocity times the duration.
+PLAY_RAD, CURVED = 0.03, 0.2
+"""Displacement within a jolt that a gear may cause [rad], a few times the backlash in a servo's data sheet, because an
+elastic gear bounces from one flank to the other; and allowance for the curvature of ordinary motion,
+as a fraction of the usual change of velocity times the duration.
 """
 
 _USUAL_S = 1.0

@@ -418,11 +418,14 @@ class Stream:
         if state.status is not None and self._guard.wants_status:
             self._bus.read_status_next()
         self._model.look(state)
-        if phase is Phase.REST:
-            self._guard.measure_noise(state)
-        if self._is_undriven and phase is Phase.REST:
+        if phase is not Phase.REST:
+            return
+        self._guard.measure_noise(state)
+        if self._is_undriven:
             self._guard.look_at_rest(state)
             self._is_undriven = self._stabiliser is None or any(state.missing)
+        else:
+            self._guard.look_while_held(state)
 
     def _brake(self) -> None:
         """Brake until the arm is slow, a read fails, time is up, or a second signal arrives. Never raises."""

@@ -124,6 +124,9 @@ class Checks:
     def look_at_rest(self, _state: State) -> None:
         self.calls.append(("at rest",))
 
+    def look_while_held(self, _state: State) -> None:
+        self.calls.append(("while held",))
+
     def measure_noise(self, _state: State) -> None:
         self.calls.append(("noise",))
 
