@@ -16,6 +16,7 @@ from hil.estimator.selection.verdict import (
     GOOD_PREDICTION,
     MUCH_LEFT,
     NOTICEABLE,
+    UNDETERMINED,
     USABLE_PREDICTION,
     WEAK,
     WELL_KNOWN,
@@ -26,7 +27,6 @@ from hil.estimator.selection.verdict import (
 
 NEARLY_EXPLAINED = 1.5  # ratio of residual to noise up to which undetermined friction near standstill does no harm
 EXPLAINED_PREDICTION = 0.15  # prediction error above which even a nearly explained motion is not trusted
-UNDETERMINED = 10.0  # standard error over value above which a parameter is not determined at all
 LITTLE_TORQUE = 0.1  # fraction of the RMS torque; gravity torques below this are negligible
 IMPROVEMENT = {
     "inertia": "faster motion",

@@ -313,7 +313,7 @@ class Selection:
         assert best.estimate is not None
         if self._left(best) > self._options.presliding_residual**2:
             return best  # effects of missing terms would be attributed to present ones
-        if not np.isfinite(best.estimate.std).any():
+        if not best.has_standard_errors:
             return self._pruned_by_fits(best)
         for level in self._options.prune_levels:
             plainest = without_nothings(best.estimate, level, self._fixed)
@@ -346,11 +346,18 @@ class Selection:
         return best
 
     def judged(self, chosen: Trial) -> Trial:
-        """Return `chosen`, unless another trial predicts the held-out motion much better."""
+        """Return `chosen`, unless it has no standard errors or another trial predicts the held-out motion much better.
+
+        An estimate has none if the motion is too sensitive to one of its terms, such as extremely stiff bristles.
+        """
+        certain = [trial for trial in self.trials if trial.has_standard_errors]
+        if not certain:
+            return chosen
+        best = min(certain, key=lambda trial: trial.score)
+        if not chosen.has_standard_errors:
+            return best
         if self._held_out is None:
             return chosen
-        fitted = [trial for trial in self.trials if trial.estimate is not None]
-        best = min(fitted, key=lambda trial: trial.score)
         return best if best.score < self._options.overrule_ratio * chosen.score else chosen
 
     @property

@@ -42,6 +42,11 @@ class Trial:
     coarse: bool = False
     """Whether the fit was allowed to stop early if it left much of the motion unexplained."""
 
+    @property
+    def has_standard_errors(self) -> bool:
+        """Whether the fit succeeded and any parameter has a finite standard error."""
+        return self.estimate is not None and bool(np.isfinite(self.estimate.std).any())
+
 
 @dataclass(frozen=True)
 class Choice:

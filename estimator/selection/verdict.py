@@ -25,6 +25,7 @@ GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # prediction error relative to 
 LEAST_PERCENT = 0.01  # smallest prediction error that is reported; smaller ones are lost in the noise
 MUCH_LEFT = 5.0  # ratio of residual to noise above which parameters are doubtful without a held-out check
 WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
+UNDETERMINED = 10.0  # standard error over value above which a parameter is not determined at all
 LITTLE_EFFECT = 0.02  # standard error of a parameter's torque, relative to the joint's, below which it hardly matters
 ALIKE = 0.99  # correlation above which two parameters are hard to separate
 NOTICEABLE = 0.005  # fraction of the residual that a term must explain to be mentioned
@@ -87,6 +88,8 @@ class Evidence:
     """Values far from those known beforehand."""
     cause: str = ""
     """A likely cause of any residual, known from how the motion was driven, as a sentence."""
+    ended_early: bool = False
+    """Whether there is no held-out motion because the recording ends before it settled."""
 
 
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:
@@ -99,7 +102,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
         *evidence.disturbances,
         *(() if evidence.disturbances else _drifted(evidence.drift, validation)),
         *_pushed(evidence.torque),
-        *_predicted(evidence.held_out, evidence.held_out_as_fitted),
+        *_predicted(evidence),
         *conflict_sentences(evidence.conflicts, explained),
         *((bound_sentence(estimate.at_bound),) if estimate.at_bound else ()),
         *evidence.doubts,
@@ -114,7 +117,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
 def _trust(validation: Validation, evidence: Evidence, at_bound: Sequence[str]) -> Trust:
     left = float(validation.residual_over_floor.max())
     against = contradicted(evidence.conflicts, left <= EXPLAINED)
-    if against == "no":
+    if against == "no" or not np.isfinite(list(validation.relative_std.values())).any():
         return "no"
     doubtful = any(_is_weak(validation, name) for name in validation.relative_std)
     doubtful = doubtful or bool(evidence.doubts or evidence.disturbances or evidence.torque or against or at_bound)
@@ -194,7 +197,7 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
     if not worst:
         return "This error does not affect the parameters significantly: even with it, each is known to 2 % or better."
     named = sorted(worst, key=lambda name: -worst[name])
-    known = {name: percent(part) if np.isfinite(part) else "not determined" for name, part in worst.items()}
+    known = {name: percent(part) if part < UNDETERMINED else "not determined" for name, part in worst.items()}
     listed = ", ".join(f"{name} ({known[name]})" for name in named[:4])
     more = f" and {len(named) - 4} others" if len(named) > 4 else ""
     if trust == "no":
@@ -294,7 +297,10 @@ def _warm_up(seconds: float) -> int:
     return int(WARM_UP_ROUNDING * np.ceil(WARM_UP_TIMES * seconds / WARM_UP_ROUNDING))
 
 
-def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ...]:
+def _predicted(evidence: Evidence) -> tuple[str, ...]:
+    held_out, as_fitted = evidence.held_out, evidence.held_out_as_fitted
+    if held_out is None and evidence.ended_early:
+        return ("The model was not validated on a held-out motion, because the recording ends before that.",)
     if held_out is None:
         return ("The model was not validated on a held-out motion: set experiment.held_out = true.",)
     worst = _percent(held_out)
@@ -343,6 +349,8 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
             f"The least certain parameter is {name}, known to within {percent(part)}. It hardly affects this arm: "
             f"its standard error is {share:.2g} % of the fitted motion's torque. To improve it, use {improvement}.",
         )
+    if part >= UNDETERMINED:
+        return (f"This motion does not determine {name}. To identify it, use {improvement}.",)
     return (
         f"The least certain parameter is {name}, known to within {percent(part)}. To improve it, use {improvement}.",
     )
@@ -351,7 +359,7 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
 def _alike(validation: Validation) -> tuple[str, ...]:
     first, second, correlation = validation.confounded
     both = max(validation.relative_std.get(name, 0.0) for name in (first, second))
-    if abs(correlation) < ALIKE or both <= WELL_KNOWN:
+    if first == second or abs(correlation) < ALIKE or both <= WELL_KNOWN:
         return ()
     return (
         f"{first} and {second} are hard to separate (correlation {correlation:.3f}): excite more "

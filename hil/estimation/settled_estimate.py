@@ -3,14 +3,12 @@
 import logging
 import time
 from concurrent.futures import Executor
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
-from hil.config.varying_delay import varying_delay
 from hil.errors import RecordingCutShort
 from hil.estimation.chain_estimate import estimate_chain_run
 from hil.estimation.drive.currents import settled_current_findings
@@ -21,16 +19,14 @@ from hil.estimation.pilot_limit import torque_limit
 from hil.estimation.plausibility import borrowed_length, conflicts_of, doubts
 from hil.estimation.result import Checks, make_result
 from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
+from hil.estimation.settled_causes import cause_of_residual
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.slips.position_jumps import jump_disturbances
 from hil.estimation.slips.rest_shift import rest_shift_warnings
-from hil.estimation.unsettled.causes import stop_in
 from hil.estimator.arrays import Array
-from hil.estimator.data.joined_periods import joined
 from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
-from hil.estimator.errors import RecordingError
 from hil.estimator.identify import Estimate
 from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import candidates, considered
@@ -40,8 +36,8 @@ from hil.estimator.selection.other_period import predict_period
 from hil.estimator.selection.settled import choose
 from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.trial import Choice
-from hil.estimator.selection.validation import Validation, validate
-from hil.estimator.selection.verdict import GOOD_PREDICTION, MUCH_LEFT, Evidence, judge
+from hil.estimator.selection.validation import validate
+from hil.estimator.selection.verdict import GOOD_PREDICTION, Evidence, judge
 from hil.estimator.simulation.back_emf import neglected
 from hil.plan.plan import HELD_OUT, IDENTIFY
 from hil.plan.stabiliser import stabiliser_share
@@ -107,7 +103,8 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
         tried_all=choice is not None,
         torque_limit=limit,
         conflicts=conflicts,
-        cause=_cause(config, period, validation),
+        cause=cause_of_residual(config, period, validation),
+        ended_early=bool(cut_short),
     )
     judged = judge(estimate, validation, evidence)
     checks = Checks(
@@ -133,15 +130,6 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     save_periods(run.path, played)
     run.write_result(result)
     return result
-
-
-def _cause(config: Config, period: SettledPeriod, validation: Validation) -> str:
-    """Return a cause of an unexplained motion: a rate that beats with the servos, or a stop; "" if none is known."""
-    said = [varying_delay(config)]
-    if float(validation.residual_over_floor.max()) > MUCH_LEFT:
-        with suppress(RecordingError):  # a joint that hardly moved
-            said.append(stop_in([joined(period, 1)]))
-    return " ".join(filter(None, said))
 
 
 def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tuple[SettledPeriod | None, list[str]]:

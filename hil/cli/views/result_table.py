@@ -189,10 +189,16 @@ def _next(result: SettledResult, run: Path) -> list[str]:
 
 
 def what_next(result: Result, run: Path) -> str:
-    """Return the line that names the next command: export, or another estimate if the numbers should not be used."""
-    if _is_useless(result):
-        return next_step("estimate", run)
-    return next_step("export", run, "--format", _usual_format(result))
+    """Return the line that names the next command: export, or if the numbers should not be used, what begins anew: a
+    check of the arm, or for recordings by other tools, which have no arm to check, an estimate of corrected ones.
+    """
+    if not _is_useless(result):
+        return next_step("export", run, "--format", _usual_format(result))
+    return next_step("estimate", run) if _is_of_recordings(result) else next_step("check", result.config)
+
+
+def _is_of_recordings(result: Result) -> bool:
+    return isinstance(result, ShootingResult) and bool(result.recordings)
 
 
 def _is_useless(result: Result) -> bool:

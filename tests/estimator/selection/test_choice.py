@@ -13,7 +13,9 @@ from hil.estimator.fit.ripple import find_waves
 from hil.estimator.fit.stage1 import fit_lines
 from hil.estimator.identify import identify
 from hil.estimator.models.model import Model
-from hil.estimator.selection.settled import choose
+from hil.estimator.options import SelectionOptions
+from hil.estimator.selection.settled import Selection, choose
+from hil.estimator.selection.trial import Trial
 from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import Evidence, judge
 from hil.fakes.plants.arm import Arm, base_parameters
@@ -185,3 +187,38 @@ def test_colour_and_structure_of_a_residual_are_seen() -> None:
     smooth = np.stack([np.convolve(row, np.ones(20) / 4.5, mode="same") for row in white])
     assert correlation_time([white]) < 12 and correlation_time([smooth]) > 20
     assert structured_share(white).max() < 0.05 and structured_share(white + smooth).min() > 0.3
+
+
+def test_an_estimate_without_standard_errors_is_not_chosen_however_well_it_predicts(
+    ideal_period: SettledPeriod,
+) -> None:
+    """Bristles of 1e8 N m/rad make the fit too sensitive for any standard error."""
+    plain = identify(ideal_period, Model(2, "coulomb", "lag"), coarse=True)
+    stiff = replace(plain, covariance=np.full_like(plain.covariance, np.inf))
+    search = Selection([ideal_period], ideal_period, (), SelectionOptions(), None)
+    search.trials = [Trial(each.model, each, None, score, 0.0) for each, score in ((plain, 8.0), (stiff, 3.0))]
+    for chosen in search.trials:
+        assert search.judged(chosen).estimate is plain
+    search.trials = search.trials[1:]
+    assert search.judged(search.trials[0]).estimate is stiff, "better than no estimate"
+    verdict = judge(stiff, validate(ideal_period, stiff), Evidence(np.zeros(2)))
+    assert verdict.trust == "no" and "hard to separate" not in " ".join(verdict.sentences)
+
+
+def test_a_parameter_that_the_motion_does_not_determine_is_not_known_to_within_a_million_percent(
+    ideal_period: SettledPeriod,
+) -> None:
+    plain = identify(ideal_period, Model(2, "coulomb", "lag"), coarse=True)
+    value, covariance = plain.value.copy(), plain.covariance.copy()
+    index = plain.names.index("coulomb_2")
+    value[index], covariance[index, index] = 1e-8, 0.7**2
+    validation = validate(ideal_period, replace(plain, value=value, covariance=covariance))
+    said = " ".join(judge(plain, validation, Evidence(np.zeros(2))).sentences)
+    assert "This motion does not determine coulomb_2. To identify it, use more slow reversals" in said
+
+
+@pytest.mark.parametrize(("ended", "said"), [(True, "the recording ends before that"), (False, "set experiment")])
+def test_why_there_is_no_held_out_motion_is_said(ideal_period: SettledPeriod, ended: bool, said: str) -> None:
+    plain = identify(ideal_period, Model(2, "coulomb", "lag"), coarse=True)
+    evidence = Evidence(None, ended_early=ended)
+    assert said in " ".join(judge(plain, validate(ideal_period, plain), evidence).sentences)

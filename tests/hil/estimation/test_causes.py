@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hil.config.schema import load_config
-from hil.estimation.settled_estimate import _cause
+from hil.estimation.settled_causes import cause_of_residual
 from hil.estimation.unsettled import causes as looked_for
 from hil.estimation.unsettled.causes import Fitted, causes
 from hil.estimation.unsettled.warnings import doubts_of
@@ -277,9 +277,31 @@ def test_a_stop_within_the_motion_is_a_cause(has_stop: bool) -> None:
     arm = recorded_arm.servo_arm({"stops": (-1.75, 3.0), "stop_stiffness": 200.0} if has_stop else {}, joints=1)  # type: ignore[dict-item]
     period = recorded_arm.record(arm, recorded_arm.wave(1, (0.3,))).rounded()
     validation = validate(period, identify(period, Model(joints=1, friction="coulomb")))
-    said = _cause(load_config(CONFIGS / "fake_pendulum.toml"), period, validation)
+    said = cause_of_residual(load_config(CONFIGS / "fake_pendulum.toml"), period, validation)
     if not has_stop:
         assert said == ""
         return
     assert "Joint 1 seems to press against something that yields" in said
     assert abs(float(said.partition("below about ")[2].partition(" rad")[0]) + 1.75) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("angle", "torque", "named"),
+    [
+        (1, 1, ""),
+        (
+            -1,
+            -1,
+            "The direction of shoulder or that of elbow is probably wrong: with angle and torque of elbow",
+        ),
+        (1, -1, "The sign of the torque of elbow is reversed: with the sign changed"),
+    ],
+)
+def test_a_joint_of_the_wrong_direction_is_a_cause(angle: int, torque: int, named: str) -> None:
+    arm = recorded_arm.servo_arm({"viscous": 0.03, "coulomb": 0.05})
+    period = recorded_arm.record(arm, recorded_arm.wave(1, (0.8, 0.42))).rounded()
+    signs = np.array([[1], [angle]]), np.array([[1], [torque]])
+    turned = replace(period, position=signs[0] * period.position, torque=signs[1] * period.torque)
+    left: Any = SimpleNamespace(residual_over_floor=np.array([60.0, 40.0]))
+    said = cause_of_residual(load_config(CONFIGS / "fake_two_link.toml"), turned, left)
+    assert said.startswith(named) and bool(said) is bool(named)
