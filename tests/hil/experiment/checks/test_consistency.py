@@ -24,8 +24,7 @@ from hil.experiment.checks.consistency import (
     moved_at_standstill,
 )
 from hil.experiment.velocity.lag import ALL_INFORMATION, BLOCK_S, ENOUGH_INFORMATION, LASTS_S, NOISE_RAD
-from tests.support.one_joint import Consistency
-from tests.support.readings import STEP, TICK, learnt_motion, quantised, seen_after
+from tests.support.one_joint import STEP, TICK, Consistency, learnt_motion, quantised, seen_after
 
 RATES = (20, 100, 400, 1000)
 

@@ -5,8 +5,7 @@ from random import Random
 
 import pytest
 
-from tests.support.one_joint import Consistency
-from tests.support.readings import STEP, TICK, learnt_motion, seen_after
+from tests.support.one_joint import STEP, TICK, Consistency, learnt_motion, seen_after
 
 
 @pytest.mark.parametrize("rate", [100, 400, 1000])
