@@ -91,11 +91,14 @@ class ServoSession:
         bus = self.bus
         self.saved.look_for_left()
         bus.check_identity()
-        bus.release_held(ours=self.saved.left)
+        bus.release_held(ours=self.saved.left_on())
         self._is_ours = True
         self.lay = where_it_lies(bus)
         if others := others_on_the_bus(bus):
-            self._say(f"Also on this bus (left alone): {'; '.join(others)}.")
+            self._say(f"Also on this bus (left alone): {'; '.join(each.described for each in others)}.")
+            for each in others:
+                if each.left:
+                    self._say(f"{each.name}: {each.left}")
         described = {
             drive: each for joint, each in zip(bus.joints, config.joints, strict=True) for drive in joint.drives
         }
@@ -232,7 +235,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
         return
     fakes.register_for(config.url)
     with ServoBus.connect(config.bus) as bus, telling_of_torque(bus):
-        session = ServoSession(bus, say, SavedSettings(bus, say))
+        session = ServoSession(bus, say, SavedSettings(bus, say, str(config.path.absolute())))
         token = _outermost.set(session)
         stopped: BaseException | None = None
         try:
