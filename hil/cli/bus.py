@@ -32,10 +32,11 @@ def scan(
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
     from hil.drivers.servo_model import BAUD_RATES
-    from hil.setup import scan as scanning
+    from hil.setup.scan import serial_ports
+    from hil.setup.session.leftovers import scan_with_leftovers
 
     if port is None:
-        print_ports(scanning.serial_ports(), json_only)
+        print_ports(serial_ports(), json_only)
         return
     for each in baud or ():
         _check_baud(each)
@@ -44,7 +45,7 @@ def scan(
     opened = open_port(port_url(port), bauds[0])
     try:
         with terminal.scanning() as watch:
-            heard = list(scanning.scan(opened, bauds, watch))
+            heard = list(scan_with_leftovers(opened, bauds, watch))
     finally:
         opened.close()
     print(json.dumps(scanned(heard))) if json_only else print_scan(heard, port)

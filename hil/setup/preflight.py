@@ -27,8 +27,8 @@ from hil.plan.find_torque import how_to_find_torque
 from hil.plan.stabiliser import too_slow
 from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.setup.bus_rate import check_rate, goals_taken, seldom_as_measured
-from hil.setup.others import others_on_the_bus
 from hil.setup.session.killed_run import recover
+from hil.setup.session.others import others_on_the_bus
 from hil.setup.session.settings_file import DamagedSettings
 
 _WARM_BELOW_LIMIT_C = 15

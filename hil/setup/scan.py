@@ -15,7 +15,6 @@ from hil.drivers.port import Port
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, VOLTAGE_UNIT
-from hil.setup.session.leftovers import about_leftovers
 
 _SLOT_S = 3e-3
 """Time slot per ID for the reply to a broadcast ping [s], the same as in dynamixel-sdk."""
@@ -33,8 +32,8 @@ class Found(NamedTuple):
     """One servo that answered.
 
     model: None if no control table has this model number. voltage [V], temperature [degrees C]: None if they could
-    not be read. trouble: description of a problem; empty if there is none. left: a sentence about what a killed run
-    left on the servo; restore: the command that restores it; both are empty if there is nothing to restore.
+    not be read. trouble: description of problems; empty if there are none. left: sentences about what a killed run left
+    on the servo; restore: the command that restores it (`session.leftovers.scan_with_leftovers`).
     """
 
     baud: int
@@ -47,6 +46,9 @@ class Found(NamedTuple):
     trouble: str
     left: str = ""
     restore: str = ""
+
+    def with_trouble(self, *more: str) -> "Found":
+        return self._replace(trouble="; ".join(filter(None, [self.trouble, *more])))
 
 
 class Heard(NamedTuple):
@@ -165,7 +167,7 @@ def _describe(port: Port, servo_id: int, data: bytes) -> Found:
 
 
 def _looked_at(port: Port, heard: Heard) -> Heard:
-    """Add to each servo's trouble whether its torque is on, and what a killed run left on it. Raises PortLost."""
+    """Add to each servo's trouble whether its torque is on and its watchdog has tripped. Raises PortLost."""
     return heard._replace(servos=tuple(_with_state(port, found) for found in heard.servos))
 
 
@@ -174,16 +176,12 @@ def _with_state(port: Port, found: Found) -> Found:
         return found
     servo = Servo(port, found.id, load_control_table(found.model))
     try:
-        troubles = [found.trouble, *_torque_troubles(servo)]
+        troubles = list(_torque_troubles(servo))
     except PortLost:
         raise
     except DriverError as problem:
-        return found._replace(trouble="; ".join(filter(None, [found.trouble, f"cannot be read: {problem}"])))
-    left = about_leftovers(servo)
-    if left is None:
-        return found._replace(trouble="; ".join(filter(None, troubles)))
-    troubles.append(left.trouble)
-    return found._replace(trouble="; ".join(filter(None, troubles)), left=left.told, restore=left.restore)
+        troubles = [f"cannot be read: {problem}"]
+    return found.with_trouble(*troubles)
 
 
 def _torque_troubles(servo: Servo) -> Iterator[str]:

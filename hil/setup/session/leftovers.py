@@ -1,18 +1,20 @@
 """What killed runs left on the servos of a port, whichever of them the present command's configuration describes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from hil.config.schema import load_config
 from hil.drivers.control_table import load_control_table, model_names
-from hil.drivers.errors import DriverError, PortLost, WrongModel
+from hil.drivers.errors import DriverError, NoReply, PortLost, WrongModel
 from hil.drivers.packet import MAX_ID
 from hil.drivers.port import Port
 from hil.drivers.preparation.settings import read_settings
 from hil.drivers.servo import Servo
 from hil.errors import HilError
 from hil.next_step import command
+from hil.setup.scan import Found, Heard, Watch, scan
 from hil.setup.session import settings_file
 from hil.setup.session.killed_run import Restored, is_left_on, recover, switch_off_left, what_is_left
 from hil.setup.session.settings_file import DamagedSettings, Kept
@@ -34,7 +36,8 @@ class Leftovers:
     trouble: str = "settings of a stopped run are not restored"
 
     def __str__(self) -> str:
-        return f"{self.told} To restore it, type: {self.restore}" if self.restore else self.told
+        fix = f" To switch its torque off and restore its settings, type: {self.restore}"
+        return f"{self.told}{fix if self.restore else ''}"
 
 
 def about_leftovers(servo: Servo) -> Leftovers | None:
@@ -50,7 +53,8 @@ def about_leftovers(servo: Servo) -> Leftovers | None:
     if kept is None or not kept.may_restore:
         return None
     restore = _restoring(kept, port)
-    run = f"hil's run of {kept.since}{_with(kept)} ended before it could restore this servo's settings"
+    when = ", ".join(filter(None, [kept.since, kept.config]))
+    run = f"An earlier hil run ({when}) ended before it could restore this servo"
     where = f"Its settings from before that run are in {kept.path}."
     try:
         differing = what_is_left(kept, servo, read_settings(servo)).differing
@@ -58,7 +62,7 @@ def about_leftovers(servo: Servo) -> Leftovers | None:
     except PortLost:
         raise
     except DriverError as error:
-        return Leftovers(f"{run}; it could not be read what differs. {error} {where}", restore)
+        return Leftovers(f"{run}; what it left could not be read: {error} {where}", restore)
     if not (differing or was_left_on):
         return None
     found = ["its torque is still on"] if was_left_on else []
@@ -67,10 +71,6 @@ def about_leftovers(servo: Servo) -> Leftovers | None:
     if is_on and not was_left_on:
         told += " Its torque is on in another mode than that run's: stop the program that is driving it first."
     return Leftovers(told, restore)
-
-
-def _with(kept: Kept) -> str:
-    return f" with {kept.config}" if kept.config else ""
 
 
 def _restoring(kept: Kept, port: Port) -> str:
@@ -93,6 +93,23 @@ def _describes(path: Path, kept: Kept, port: Port) -> bool:
     return found == kept and (kept.id, kept.model) in described and (not port.has_baud or bus.baud == port.baud)
 
 
+def scan_with_leftovers(port: Port, bauds: Sequence[int], watch: Watch) -> Iterator[Heard]:
+    """Scan like `hil.setup.scan.scan`, and add what killed runs left on the servos. Nothing is written to a servo.
+
+    Raises PortLost.
+    """
+    for heard in scan(port, bauds, watch):
+        # The port is still at this baud rate.
+        yield heard._replace(servos=tuple(_with_leftovers(port, found) for found in heard.servos))
+
+
+def _with_leftovers(port: Port, found: Found) -> Found:
+    if found.model is None:
+        return found
+    left = about_leftovers(Servo(port, found.id, load_control_table(found.model)))
+    return found if left is None else found.with_trouble(left.trouble)._replace(left=left.told, restore=left.restore)
+
+
 def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> None:
     """Restore every servo of this port that a killed run left unrestored and that answers at the port's baud rate.
 
@@ -100,7 +117,8 @@ def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> None:
     since, that servo is left as it is.
 
     needed: ID of the servo that the caller needs. say: receives a message for each servo that was restored or could not
-    be. Raises PortLost, and the errors of `recover` for the needed servo once the others have been restored.
+    be. Raises PortLost and, once all others have been restored, the error of `recover` for the needed servo if it
+    answers.
     """
     failed: dict[Servo, DriverError] = {}
     was_on: dict[Servo, bool] = {}
@@ -119,13 +137,14 @@ def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> None:
             raise
         except DriverError as error:
             failed[servo] = error
-    for servo, error in failed.items():
-        if servo.id != needed or isinstance(error, WrongModel):
-            path = settings_file.settings_path(port.url, servo.id, servo.table.model)
-            say(f"{servo.title}: the settings that an earlier run left are not restored yet ({path}). {error}")
-    for servo, error in failed.items():
-        if servo.id == needed and not isinstance(error, WrongModel):
-            raise error
+    unreached = {
+        servo: why for servo, why in failed.items() if servo.id != needed or isinstance(why, WrongModel | NoReply)
+    }
+    for servo, why in unreached.items():
+        say(f"{servo.title}: what an earlier run left is not restored yet{_file_of(servo)}. {why}")
+    for servo, why in failed.items():
+        if servo not in unreached:
+            raise why
 
 
 def _on_file(port: Port) -> list[Servo]:
@@ -136,6 +155,14 @@ def _on_file(port: Port) -> list[Servo]:
         for servo_id, model in settings_file.servos_on_file(port.url)
         if model in known and servo_id <= MAX_ID
     ]
+
+
+def _file_of(servo: Servo) -> str:
+    """The file with this servo's settings, in parentheses; "" if it is damaged, since the error then names it."""
+    with suppress(DamagedSettings):
+        if kept := settings_file.load(servo.port.url, servo.id, servo.table.model):
+            return f" ({kept.path})"
+    return ""
 
 
 def _switched_off(servo: Servo) -> bool:

@@ -23,9 +23,9 @@ from hil.drivers.servo_model import Mode
 from hil.drivers.torque.off import and_list, signals_held_back
 from hil.drivers.torque.switch import WATCH_S
 from hil.setup.changed_settings import Settings, settings_now
-from hil.setup.others import others_on_the_bus
 from hil.setup.session import settings_file
 from hil.setup.session.end_of_session import end_with, telling_of_torque
+from hil.setup.session.others import others_on_the_bus
 from hil.setup.session.saved_settings import SavedSettings
 from hil.setup.session.unrestored import unrestored
 from hil.setup.unmoved import Lies, where_it_lies
