@@ -32,10 +32,11 @@ def scan(
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
     from hil.drivers.servo_model import BAUD_RATES
-    from hil.setup import scan as scanning
+    from hil.setup.scan import serial_ports
+    from hil.setup.session.leftovers import scan_with_leftovers
 
     if port is None:
-        print_ports(scanning.serial_ports(), json_only)
+        print_ports(serial_ports(), json_only)
         return
     for each in baud or ():
         _check_baud(each)
@@ -44,7 +45,7 @@ def scan(
     opened = open_port(port_url(port), bauds[0])
     try:
         with terminal.scanning() as watch:
-            heard = list(scanning.scan(opened, bauds, watch))
+            heard = list(scan_with_leftovers(opened, bauds, watch))
     finally:
         opened.close()
     print(json.dumps(scanned(heard))) if json_only else print_scan(heard, port)
@@ -91,6 +92,7 @@ def pose(
     from hil.drivers.bus import ServoBus
     from hil.errors import ConfigError
     from hil.setup.by_hand import guided, pose_of
+    from hil.setup.session.leftovers import about_leftovers
 
     arm = load_config(config)
     if arm.arm.urdf is None:
@@ -98,6 +100,9 @@ def pose(
     fakes.register_for(arm.url)
     with ServoBus.connect(arm.bus) as bus:
         bus.check_identity()
+        for joint, servo in bus.drives.items():
+            if left := about_leftovers(servo):
+                print(f"{joint.title}: {left}", file=sys.stderr)
         bus.release_held()
         here = pose_of(arm, bus.read_positions())
         if not json_only:
@@ -135,13 +140,16 @@ def setup(
     yes: Annotated[bool, typer.Option("--yes", help="Answer yes to every question.")] = False,
     json_only: Json = False,
 ) -> None:
-    """Set a servo's ID, baud rate, return delay or Secondary ID. Asks before each write and reads each value back."""
+    """Set a servo's ID, baud rate, return delay or Secondary ID. Asks before each write and reads each value back.
+
+    First restores all servos of this port that a killed run left with torque on or with its settings.
+    """
     from hil.cli.views.question import agrees
     from hil.cli.views.setup_view import changed, print_changes
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
     from hil.setup.servo_settings import RETURN_DELAY_UNIT_US, open_servo, set_up
-    from hil.setup.session.killed_run import recover
+    from hil.setup.session.leftovers import recover_all
 
     for each in (baud, new_baud):
         if each is not None:
@@ -152,12 +160,8 @@ def setup(
         raise typer.BadParameter("--json cannot ask for confirmation: add --yes.")
     opened = open_port(port_url(port), baud)
     try:
+        recover_all(opened, servo_id, lambda text: print(text, file=sys.stderr))
         servo = open_servo(opened, servo_id)
-        restored = recover(servo, opened.url)
-        if written := ", ".join(restored.written):
-            print(f"Restored settings left behind by an earlier run: {written}.", file=sys.stderr)
-        if restored.others:
-            print(f"{servo.title}: {restored.others}", file=sys.stderr)
         confirm: Callable[[str], bool] = (lambda _: True) if yes else agrees
         changes = set_up(
             servo,

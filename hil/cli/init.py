@@ -30,7 +30,7 @@ def init(
     from hil.setup.config_template import arm_toml
     from hil.setup.interview import interview
     from hil.setup.measured_bus import measured_bus
-    from hil.setup.scan import scan
+    from hil.setup.session.leftovers import scan_with_leftovers
 
     url = port_url(port)
     bauds = tuple(baud or BAUD_RATES)
@@ -42,7 +42,7 @@ def init(
         if not out.absolute().parent.is_dir():
             raise ConfigError(f"--out {out}: the folder {out.parent} does not exist. Create it first.")
         with terminal.scanning() as watch:
-            heard = list(scan(opened, bauds, watch))
+            heard = list(scan_with_leftovers(opened, bauds, watch))
         answers = interview(opened, url_for(url, out), heard, _default if yes else answer, _say)
     finally:
         opened.close()

@@ -38,6 +38,9 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
     port.set_baud(baud)
     chosen = _choose(servos, ask, say)
     handles = [Servo(port, found.id, load_control_table(str(found.model))) for found in chosen]
+    if left := [f"ID {each.id}: {each.left}" for each in chosen if each.left]:
+        restore = next((f" Type: {each.restore}" for each in chosen if each.restore), "")
+        raise ExperimentError(f"{' '.join(left)}{restore}")
     for servo in handles:
         if servo.read("Torque Enable"):
             raise ExperimentError(f"{servo.title} still has its torque on. Power-cycle it, then start again.")

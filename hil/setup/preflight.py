@@ -27,8 +27,8 @@ from hil.plan.find_torque import how_to_find_torque
 from hil.plan.stabiliser import too_slow
 from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.setup.bus_rate import check_rate, goals_taken, seldom_as_measured
-from hil.setup.others import others_on_the_bus
 from hil.setup.session.killed_run import recover
+from hil.setup.session.others import others_on_the_bus
 from hil.setup.session.settings_file import DamagedSettings
 
 _WARM_BELOW_LIMIT_C = 15
@@ -170,7 +170,13 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
         return
     if found:
         fix = "They are left alone: neither their torque nor their settings are changed."
-        yield Finding(Level.WARNING, config.port.url, "other servos on this bus", "; ".join(found), fix)
+        yield Finding(
+            Level.WARNING, config.port.url, "other servos on this bus", "; ".join(each.described for each in found), fix
+        )
+    for each in found:
+        if each.left:
+            what = "settings from an earlier run"
+            yield Finding(Level.WARNING, config.port.url, what, f"not restored on {each.name}", each.left)
 
 
 def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> Iterator[Finding]:
@@ -241,6 +247,8 @@ def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding
         return
     if written := ", ".join(restored.written):
         yield Finding(Level.OK, str(joint), what, f"that run ended before restoring them; restored now: {written}")
+    if restored.was_on:
+        yield Finding(Level.OK, str(joint), "torque of an earlier run", "was still on; switched off now")
     if restored.others:
         yield Finding(
             Level.WARNING,

@@ -9,9 +9,10 @@ from typing import NamedTuple
 from serial.tools import list_ports
 
 from hil.drivers.control_table import load_control_table, model_names
-from hil.drivers.errors import DriverError, PortNotOpened
+from hil.drivers.errors import DriverError, PortLost, PortNotOpened
 from hil.drivers.packet import BROADCAST_ID, MAX_ID, Framer, Instruction, encode
 from hil.drivers.port import Port
+from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, VOLTAGE_UNIT
 
@@ -31,7 +32,8 @@ class Found(NamedTuple):
     """One servo that answered.
 
     model: None if no control table has this model number. voltage [V], temperature [degrees C]: None if they could
-    not be read. trouble: description of a problem; empty if there is none.
+    not be read. trouble: description of problems; empty if there are none. left: sentences about what a killed run left
+    on the servo; restore: the command that restores it (`session.leftovers.scan_with_leftovers`).
     """
 
     baud: int
@@ -42,6 +44,11 @@ class Found(NamedTuple):
     voltage: float | None
     temperature: float | None
     trouble: str
+    left: str = ""
+    restore: str = ""
+
+    def with_trouble(self, *more: str) -> "Found":
+        return self._replace(trouble="; ".join(filter(None, [self.trouble, *more])))
 
 
 class Heard(NamedTuple):
@@ -80,11 +87,11 @@ def scan(port: Port, bauds: Sequence[int] = BAUD_RATES, watch: Watch = lambda _:
 
     Baud rates that the adapter does not support are reported as trouble. Over TCP, where the remote end sets the baud
     rate, servos are asked once, and each reports which baud rate it is set to. watch: called while waiting, and with
-    each servo that answers.
+    each servo that answers. Nothing is written to a servo.
     """
     if not port.has_baud:
         heard = listen(port, watch=watch)
-        yield heard._replace(baud=_set_to(port, heard.servos))
+        yield _looked_at(port, heard._replace(baud=_set_to(port, heard.servos)))
         return
     for place, baud in enumerate(bauds):
         behind_s = sum(_listening_s(port, later) for later in bauds[place + 1 :])
@@ -93,7 +100,7 @@ def scan(port: Port, bauds: Sequence[int] = BAUD_RATES, watch: Watch = lambda _:
         except PortNotOpened as error:
             yield Heard(baud, (), str(error))
             continue
-        yield listen(port, watch=_with_more(behind_s, watch))
+        yield _looked_at(port, listen(port, watch=_with_more(behind_s, watch)))
 
 
 def _set_to(port: Port, servos: Sequence[Found]) -> int:
@@ -157,3 +164,28 @@ def _describe(port: Port, servo_id: int, data: bytes) -> Found:
         return Found(baud, servo_id, number, model, firmware, None, None, f"cannot be read: {problem}")
     trouble = f"hardware error: {describe_error(error)}; reboot it" if error else ""
     return Found(baud, servo_id, number, model, firmware, round(voltage, 1), temperature, trouble)
+
+
+def _looked_at(port: Port, heard: Heard) -> Heard:
+    """Add to each servo's trouble whether its torque is on and its watchdog has tripped. Raises PortLost."""
+    return heard._replace(servos=tuple(_with_state(port, found) for found in heard.servos))
+
+
+def _with_state(port: Port, found: Found) -> Found:
+    if found.model is None or found.voltage is None:
+        return found
+    servo = Servo(port, found.id, load_control_table(found.model))
+    try:
+        troubles = list(_torque_troubles(servo))
+    except PortLost:
+        raise
+    except DriverError as problem:
+        troubles = [f"cannot be read: {problem}"]
+    return found.with_trouble(*troubles)
+
+
+def _torque_troubles(servo: Servo) -> Iterator[str]:
+    if servo.read("Torque Enable"):
+        yield "torque on"
+    if "Bus Watchdog" in servo.table and servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
+        yield "watchdog tripped"

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from hil.drivers.control_table import load_control_table, model_names
 from hil.drivers.errors import NoReply, ServoRefused, WrongModel, WrongReply, WrongSetting
 from hil.drivers.port import Port
+from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import BAUD_RATES
 
@@ -40,9 +41,10 @@ def open_servo(port: Port, servo_id: int) -> Servo:
         )
     servo = Servo(port, servo_id, load_control_table(model))
     if servo.read("Torque Enable"):
-        raise WrongSetting(
-            f"{servo.title} has torque on, which locks its EEPROM. Stop the program that is driving it, then try again."
-        )
+        fix = "Stop the program that is driving it, then try again."
+        if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
+            fix = "A program that has ended left it on, and the servo's watchdog has tripped. Power-cycle the servo."
+        raise WrongSetting(f"{servo.title} has torque on, which locks its EEPROM. {fix}")
     return servo
 
 

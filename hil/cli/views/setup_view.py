@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from hil.config.schema import config_of
-from hil.next_step import next_step
+from hil.next_step import NEXT, next_step
 from hil.printing import print_fitting, result_console, say, say_behind
 from hil.setup.preflight import Finding, Level
 from hil.setup.scan import Found, Heard
@@ -57,6 +57,9 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
     for each in heard:
         if each.trouble:
             console.print(f"At {each.baud} baud: {escape(each.trouble)}")
+    for servo in servos:
+        if servo.left:
+            say(console, f"ID {servo.id}: {servo.left}")
     if len({servo.baud for servo in servos}) > 1:
         console.print("All servos of an arm must use the same baud rate: see hil setup --help.")
     if servos:
@@ -64,7 +67,11 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
 
 
 def _after_scan(servos: Sequence[Found], port: str) -> str:
-    """Return the next command: set all servos to one baud rate if necessary, otherwise describe or check the arm."""
+    """Return the next command: restore what a killed run left, set all servos to one baud rate, or describe or check
+    the arm.
+    """
+    if restore := next((servo.restore for servo in servos if servo.restore), ""):
+        return f"{NEXT}{restore}"
     if config_of(port):
         return next_step("check", port)
     if len({servo.baud for servo in servos}) > 1:

@@ -7,6 +7,7 @@ It is reported but not restored, since the user may have wanted the change.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from hil.drivers.errors import TorqueHeld
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import attainable, put_back, read_settings
 from hil.drivers.servo import Servo
@@ -30,12 +31,17 @@ class Left:
 
     kept: the settings before that program. changed: the registers that another program has changed since then, each
     with its present value. wanted: the settings to restore; the changed registers keep their present values.
+    differing: the registers to restore, each with its present value and the one to restore.
     """
 
     kept: Kept
     wanted: dict[str, int]
     changed: dict[str, int]
-    is_to_restore: bool
+    differing: dict[str, tuple[int | None, int]]
+
+    @property
+    def is_to_restore(self) -> bool:
+        return bool(self.differing)
 
     def told(self, title: str) -> str:
         """Return a message that states what is restored and what is not; it begins with `title`, the name of the
@@ -85,20 +91,53 @@ def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
     }
     settings = {**present, **{name: kept.settings[name] for name in kept.changed if name in kept.settings}}
     wanted = {**(settings if _MODE in changed else kept.settings), **changed}
-    is_to_restore = any(present.get(name) != value for name, value in attainable(servo, wanted).items())
-    return Left(kept, wanted, changed, is_to_restore)
+    possible = attainable(servo, wanted)
+    differing = {name: (present.get(name), value) for name, value in possible.items() if present.get(name) != value}
+    return Left(kept, wanted, changed, differing)
+
+
+def is_left_on(servo: Servo, kept: Kept) -> bool:
+    """Return whether the killed program left this servo's torque on. Raises the errors of `Servo.read`.
+
+    If torque is on in another mode than that program's, another program has switched it on since.
+    """
+    return bool(servo.read("Torque Enable")) and kept.changed.get(_MODE) in (None, servo.read(_MODE))
+
+
+def switch_off_left(servo: Servo, kept: Kept) -> bool:
+    """Switch off torque that the killed program left on; return whether it was on.
+
+    Raises TorqueHeld if another program has switched it on since, and the errors of `Servo.write`.
+    """
+    if is_left_on(servo, kept):
+        servo.write("Torque Enable", 0)
+        return True
+    if servo.read("Torque Enable"):
+        raise TorqueHeld(
+            f"{servo.title}: its torque is on in Operating Mode {servo.read(_MODE)}, but the run of {kept.since} that "
+            f"ended without restoring it had set {kept.changed.get(_MODE)}: another program has switched torque on "
+            "since. Stop that program, then try again."
+        )
+    return False
 
 
 @dataclass(frozen=True)
 class Restored:
-    """The settings written by `recover`, as text, and a sentence about changes by another program; "" if none."""
+    """What `recover` did.
+
+    written: the restored settings, as text. others: a sentence about changes by another program; "" if none. was_on:
+    whether torque was on and has been switched off.
+    """
 
     written: list[str] = field(default_factory=list)
     others: str = ""
+    was_on: bool = False
 
 
 def recover(servo: Servo, port: str) -> Restored:
-    """Restore settings left behind by a terminated program. Raises the same errors as `Servo.write`.
+    """Restore settings left behind by a terminated program, and switch off torque that it left on.
+
+    Raises the same errors as `Servo.write`, DamagedSettings, and TorqueHeld if another program has switched torque on.
 
     The file with the earlier settings is kept as long as another program's value prevents a register from being
     restored.
@@ -106,11 +145,10 @@ def recover(servo: Servo, port: str) -> Restored:
     kept = settings_file.load(port, servo.id, servo.table.model)
     if kept is None or not kept.may_restore:
         return Restored()
-    if servo.read("Torque Enable"):
-        servo.write("Torque Enable", 0)
+    was_on = switch_off_left(servo, kept)
     left = what_is_left(kept, servo, read_settings(servo))
     written = put_back(servo, left.wanted)
     if not left.changed:
         settings_file.forget(kept)
     told = [f"{name} {before} -> {after}" for name, (before, after) in written.items()]
-    return Restored(told, left.others if left.changed else "")
+    return Restored(told, left.others if left.changed else "", was_on)

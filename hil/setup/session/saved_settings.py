@@ -10,7 +10,7 @@ from hil.drivers.preparation.settings import attainable, put_back, unlike
 from hil.drivers.servo import Servo
 from hil.errors import RunFolderError
 from hil.setup.session import settings_file
-from hil.setup.session.killed_run import Left, left_behind, what_is_left
+from hil.setup.session.killed_run import Left, is_left_on, left_behind, what_is_left
 from hil.setup.session.settings_file import Kept
 
 _REST_S = 0.05
@@ -24,11 +24,12 @@ _MOST_CHECKS = 3
 class SavedSettings:
     """The settings to restore. Each servo has a file on disk until its settings have been restored.
 
-    say: receives messages for the user.
+    say: receives messages for the user. config: absolute path of the arm's configuration, which the files name.
     """
 
     bus: ServoBus
     _say: Callable[[str], None]
+    config: str = ""
     left: dict[Joint, Kept] = field(default_factory=dict)
     """Saved settings of the servos that an earlier run did not restore."""
     kept: dict[Joint, Kept] = field(default_factory=dict)
@@ -48,6 +49,10 @@ class SavedSettings:
         """Find the settings that an earlier run on this port did not restore. Raises DamagedSettings."""
         url = self.bus.port.url
         self.left = {joint: kept for joint in self.bus.drives if (kept := left_behind(url, joint)) is not None}
+
+    def left_on(self) -> list[Joint]:
+        """Servos whose torque an earlier run on this port left on. Raises the errors of `Servo.read`."""
+        return [joint for joint, kept in self.left.items() if is_left_on(self.bus.drives[joint], kept)]
 
     def save(self, joint: Joint, settings: dict[str, int], changed: dict[str, int]) -> None:
         """Write a servo's settings to disk. changed: the EEPROM registers that this session will set.
@@ -77,7 +82,7 @@ class SavedSettings:
         url, model = self.bus.port.url, joint.servo.name
         self.wanted[joint] = settings
         try:
-            self.kept[joint] = settings_file.keep(url, joint.id, model, settings, changed, since)
+            self.kept[joint] = settings_file.keep(url, joint.id, model, settings, changed, since, self.config)
         except RunFolderError as error:
             values = ", ".join(f"{name} {value}" for name, value in settings.items())
             self._say(

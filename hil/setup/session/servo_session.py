@@ -23,9 +23,9 @@ from hil.drivers.servo_model import Mode
 from hil.drivers.torque.off import and_list, signals_held_back
 from hil.drivers.torque.switch import WATCH_S
 from hil.setup.changed_settings import Settings, settings_now
-from hil.setup.others import others_on_the_bus
 from hil.setup.session import settings_file
 from hil.setup.session.end_of_session import end_with, telling_of_torque
+from hil.setup.session.others import others_on_the_bus
 from hil.setup.session.saved_settings import SavedSettings
 from hil.setup.session.unrestored import unrestored
 from hil.setup.unmoved import Lies, where_it_lies
@@ -91,11 +91,14 @@ class ServoSession:
         bus = self.bus
         self.saved.look_for_left()
         bus.check_identity()
-        bus.release_held(ours=self.saved.left)
+        bus.release_held(ours=self.saved.left_on())
         self._is_ours = True
         self.lay = where_it_lies(bus)
         if others := others_on_the_bus(bus):
-            self._say(f"Also on this bus (left alone): {'; '.join(others)}.")
+            self._say(f"Also on this bus (left alone): {'; '.join(each.described for each in others)}.")
+            for each in others:
+                if each.left:
+                    self._say(f"{each.name}: {each.left}")
         described = {
             drive: each for joint, each in zip(bus.joints, config.joints, strict=True) for drive in joint.drives
         }
@@ -232,7 +235,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
         return
     fakes.register_for(config.url)
     with ServoBus.connect(config.bus) as bus, telling_of_torque(bus):
-        session = ServoSession(bus, say, SavedSettings(bus, say))
+        session = ServoSession(bus, say, SavedSettings(bus, say, str(config.path.absolute())))
         token = _outermost.set(session)
         stopped: BaseException | None = None
         try:

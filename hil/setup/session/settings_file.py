@@ -24,6 +24,7 @@ COPY_NAME = "servo_settings.json"
 """Name of the copy of the saved settings in the run folder."""
 
 _LONGEST_NAME = 80
+_FILE_NAME = re.compile(r".*_ID(\d+)_(.+)\.json", re.ASCII)
 
 
 class DamagedSettings(WrongSetting):
@@ -36,6 +37,7 @@ class Kept:
 
     changed: the EEPROM registers that the program sets, with their values. program: the program's process ID. adapter:
     persistent name of the USB adapter; "" if it has none. device: the device behind the port's name; "" if it has none.
+    config: absolute path of the program's configuration; "" if unknown, as in files of earlier versions.
     """
 
     port: str
@@ -47,6 +49,7 @@ class Kept:
     since: str
     adapter: str = ""
     device: str = ""
+    config: str = ""
 
     @property
     def path(self) -> Path:
@@ -89,16 +92,22 @@ def _device(port: str) -> str:
 
 
 def keep(
-    port: str, servo_id: int, model: str, settings: dict[str, int], changed: dict[str, int], since: str = ""
+    port: str,
+    servo_id: int,
+    model: str,
+    settings: dict[str, int],
+    changed: dict[str, int],
+    since: str = "",
+    config: str = "",
 ) -> Kept:
     """Write the file of a servo; it is on disk when this function returns. Raises RunFolderError.
 
     A file of the same servo under another name of the port is removed afterwards.
 
-    since: when these settings were first saved; by default, now.
+    since: when these settings were first saved; by default, now. config: absolute path of the configuration.
     """
     since = since or datetime.now().astimezone().isoformat(timespec="seconds")
-    kept = Kept(port, servo_id, model, settings, changed, os.getpid(), since, adapter_name(port), _device(port))
+    kept = Kept(port, servo_id, model, settings, changed, os.getpid(), since, adapter_name(port), _device(port), config)
     former = load(port, servo_id, model)
     write_durably(kept.path, {"schema": SCHEMA, **asdict(kept)})
     if former is not None and former.path != kept.path:
@@ -129,6 +138,19 @@ def load(port: str, servo_id: int, model: str) -> Kept | None:
     return next((each for each in found if each is not None and each.device == device and not each.adapter), None)
 
 
+def servos_on_file(port: str) -> list[tuple[int, str]]:
+    """ID and model of each servo for which there is a file of this port, even a damaged one, ordered by ID."""
+    named = (_FILE_NAME.fullmatch(each.name) for each in state_folder().glob("*.json"))
+    return sorted(each for each in {(int(name[1]), name[2]) for name in named if name} if _has_file(port, *each))
+
+
+def _has_file(port: str, servo_id: int, model: str) -> bool:
+    try:
+        return load(port, servo_id, model) is not None
+    except DamagedSettings:
+        return True
+
+
 def _contents(path: Path) -> bytes | None:
     """Return the contents of a file, none if they cannot be read; None if there is no such file."""
     try:
@@ -151,7 +173,7 @@ def _parsed(contents: bytes) -> Kept | None:
         isinstance(table, dict) and all(type(value) is int for value in table.values())
         for table in (kept.settings, kept.changed)
     )
-    return kept if numbers and type(kept.program) is int else None
+    return kept if numbers and type(kept.program) is int and type(kept.config) is str else None
 
 
 def forget(kept: Kept) -> str:
