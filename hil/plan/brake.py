@@ -36,6 +36,11 @@ GETS_FASTER = 0.2
 Some increase is normal: gravity and the other joint's brake act on the joint.
 """
 
+STILL_FASTER, SLOWS_AFTER_S = 0.06, 0.02
+"""The same once braking has lasted for this time [s]: a joint with a high velocity limit could otherwise be driven by a
+reversed motor until braking ends.
+"""
+
 NOTICED_AFTER = 2
 """Number of samples for which a brake with the wrong sign acts before it is detected: one, plus the one in progress."""
 
@@ -73,7 +78,9 @@ class Brake:
     def __init__(self, config: Config, interval: float | None = None, recent: RecentMotion | None = None) -> None:
         self._gains = braking_gains(config, interval)
         self._limits = [joint.goal_limit for joint in config.joints]
-        self._allowed = [GETS_FASTER * joint.velocity_limit for joint in config.joints]
+        self._fastest = [joint.velocity_limit for joint in config.joints]
+        self._first_samples = SLOWS_AFTER_S * config.experiment.rate if interval is None else SLOWS_AFTER_S / interval
+        self._samples = 0
         self._enough = config.safety.rest_velocity
         self._recent = RecentMotion(config, interval) if recent is None else recent
         self._first: tuple[list[float], list[float]] | None = None
@@ -97,8 +104,10 @@ class Brake:
         """Whether a joint is clearly faster than when braking began, judging by its reported or its visible speed."""
         if self._first is None:
             self._first = reported, visible
+        share = GETS_FASTER if self._samples < self._first_samples else STILL_FASTER
+        self._samples += 1
         return any(
-            now > first + more
+            now > first + share * fastest
             for speeds, begun in zip((reported, visible), self._first, strict=True)
-            for now, first, more in zip(speeds, begun, self._allowed, strict=True)
+            for now, first, fastest in zip(speeds, begun, self._fastest, strict=True)
         )

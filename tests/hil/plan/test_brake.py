@@ -93,6 +93,15 @@ def test_no_current_in_the_direction_in_which_the_position_moves(arm: Arm, inter
         assert brake.goals(moving) == pytest.approx([braking_gains(arm(), interval)[0] * -3.0, 0.0])
 
 
+@pytest.mark.parametrize(("more", "goes_on"), [(1.1, True), (1.3, False)])
+def test_a_joint_that_is_still_faster_after_a_while_ends_it(arm: Arm, more: float, goes_on: bool) -> None:
+    """As with a reversed motor that may run at 20 rad/s: after 20 ms, 6 % of this is too much."""
+    brake = brake_of(arm(), MOVING)
+    faster = MOVING._replace(velocity=(0.0, -4.0 - more))
+    goals = [brake.goals(each) for each in (MOVING, *8 * [faster])]
+    assert None not in goals[:8] and (goals[8] is not None) is goes_on
+
+
 @pytest.mark.parametrize("interval", [0.0025, 0.01])
 def test_hardly_any_current_while_the_position_stands_still(arm: Arm, interval: float) -> None:
     still = MOVING._replace(velocity=(0.0, 0.0))
