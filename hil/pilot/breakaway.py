@@ -4,14 +4,33 @@ Just above a joint's static friction, motion grows quickly: on many of the plaus
 makes a joint exceed a limit. Therefore the guard is given narrow limits for such joints, and the torque is raised by a
 constant ratio from run to run, up to the current limit. As soon as the joint moves and so reveals its friction, the arm
 is braked and the run ends.
+
+A joint that gravity presses against a stop stands still as well, until its torque lifts it. The next runs would let it
+bounce on the stop, which a planar arm's model does not contain.
 """
+
+import math
+from contextlib import suppress
 
 import numpy as np
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
 from hil.estimator.arrays import Array, Mask
+from hil.estimator.baselines.torque_faults import suspect_stop
+from hil.estimator.data.recording import Recording
+from hil.estimator.errors import RecordingError
 from hil.pilot.options import PilotOptions
+from hil.pilot.seen import Seen
+
+_LEANS = 0.1
+"""Cosine of a link's angle at rest from which gravity may press it against something."""
+
+_AT_REST_RAD = 0.03
+"""Largest distance of a stop from the pose before the run [rad]."""
+
+_UNEXPLAINED = 0.25
+"""Smallest fraction of the torque that inverse dynamics must leave unexplained without a stop."""
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
@@ -47,3 +66,25 @@ def broke_free(config: Config, narrow: Config, seen: Array) -> Mask:
     near_low, near_high = np.array([joint.position_limit for joint in narrow.joints]).T
     closer = (near_low > low) | (near_high < high)
     return np.asarray(closer & ((seen[0] < near_low) | (seen[1] > near_high)))
+
+
+def resting_on_stop(config: Config, seen: Seen) -> str:
+    """Explain that a planar arm's joint rests on something which it leaves in one direction only; "" if it does not."""
+    leans = any(abs(math.cos(angle)) > _LEANS for angle in np.cumsum(config.arm.rest_pose))
+    if config.arm.gravity == 0.0 or not leans:
+        return ""
+    steps = np.array([joint.joint.servo.position_unit for joint in config.joints])
+    time = np.arange(seen.torque.shape[1]) / config.experiment.rate
+    stop = None
+    with suppress(RecordingError):  # a joint that hardly moved
+        stop = suspect_stop([Recording(time, seen.torque, seen.position, steps, "held")])
+    if stop is None or stop.residual_given < _UNEXPLAINED or abs(stop.at - seen.pose[stop.joint - 1]) > _AT_REST_RAD:
+        return ""
+    return (
+        f"{config.joints[stop.joint - 1].joint.title} rests on something that yields (a stop, a table or a cable) at "
+        f"{stop.at:.2f} rad: with a stiffness of {float(f'{stop.stiffness:.2g}'):g} N m/rad there, inverse dynamics "
+        f"leaves {100 * stop.residual:.2g} % of the torque unexplained instead of {100 * stop.residual_given:.2g} %. "
+        "Every further run would press and bounce against it, and a planar arm's model contains no stop. Change the "
+        "mounting, or what the arm rests on, so that it hangs freely, then correct arm.rest_pose; or describe the arm "
+        "by a URDF, whose joints may rest against their stops."
+    )

@@ -20,7 +20,7 @@ from hil.estimator.arrays import Array, Mask
 from hil.estimator.excitation.harmonics import harmonics_within
 from hil.estimator.models.parameters import Physics
 from hil.pilot.belief import MOVED_STEPS, Belief, earlier_belief, prior_belief
-from hil.pilot.breakaway import broke_free, narrowed, raised
+from hil.pilot.breakaway import broke_free, narrowed, raised, resting_on_stop
 from hil.pilot.gains import falls_over, with_stabiliser
 from hil.pilot.options import PilotOptions
 from hil.pilot.steps import Played, Player, Step
@@ -106,7 +106,10 @@ class Search:
         return self._raise_to_limits()
 
     def learn(self, config: Config, played: Played) -> None:
-        """Update the belief with the outcome of a run of `config`."""
+        """Update the belief with the outcome of a run of `config`.
+
+        Raises ExperimentError if the run shows that the arm rests on a stop.
+        """
         self.steps.append(played.step)
         if config.stabiliser is not None:
             self.springs = np.array(config.stabiliser.stiffness) > 0.0  # a joint that had one keeps it
@@ -122,6 +125,8 @@ class Search:
         self._stay_within_supply(played)
         if played.seen is None:
             return
+        if stop := resting_on_stop(config, played.seen):
+            raise ExperimentError(stop)
         self.belief = self.belief.after(config, played.seen)
         self.pose = _within_limits(self.config, played.seen.end, self.options.start_inside)
 

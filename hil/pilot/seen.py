@@ -17,12 +17,13 @@ _FEWEST = 40  # smallest useful number of samples
 class Seen:
     """Commands and motion of a run.
 
-    command: torque without the stabiliser's contribution (joints, samples) [N m]. position: measured angles (joints,
-    samples) [rad], NaN where a reply is missing. pose: pose before the run (joints,) [rad]. end: last pose (joints,)
-    [rad].
+    command, torque: torque without and with the stabiliser's contribution (joints, samples) [N m]. position: measured
+    angles (joints, samples) [rad], NaN where a reply is missing. pose: pose before the run (joints,) [rad]. end: last
+    pose (joints,) [rad].
     """
 
     command: Array
+    torque: Array
     position: Array
     pose: Array
     end: Array
@@ -42,15 +43,17 @@ def seen_of(config: Config, samples: NDArray[np.void]) -> Seen | None:
     if rows.size < _FEWEST or not before.size:
         return None
     constants = np.array([joint.torque_per_goal for joint in config.joints])
-    command = samples["goal_current"][rows].T * constants[:, None]
+    torque = samples["goal_current"][rows].T * constants[:, None]
+    command = torque
     if config.stabiliser is not None:
         with_former = samples[rows[0] - 1 : rows[-1] + 1]
-        command = command - np.nan_to_num(feedback_torque(config, with_former)).T
+        command = torque - np.nan_to_num(feedback_torque(config, with_former)).T
     position = samples["position"][rows].T.astype(np.float64)
     pose = _last_finite(samples["position"][before])
     if not np.isfinite(pose).all() or not np.isfinite(position).any(axis=1).all():
         return None
-    return Seen(np.ascontiguousarray(command), position, pose, _last_finite(samples["position"]))
+    end = _last_finite(samples["position"])
+    return Seen(np.ascontiguousarray(command), np.ascontiguousarray(torque), position, pose, end)
 
 
 def _last_finite(position: Array) -> Array:

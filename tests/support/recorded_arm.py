@@ -52,10 +52,13 @@ class Recorded:
         return self.period(np.round(self.position / self.step) * self.step)
 
 
-def servo_arm(friction: dict[str, float], joints: int = 2) -> Arm:
-    """The arm of configs/fake_two_link.toml, or its first link, with this friction and drive."""
+def servo_arm(friction: dict[str, Any], joints: int = 2, start: float = -math.pi / 2) -> Arm:
+    """The arm of configs/fake_two_link.toml, or its first link, with this friction and drive.
+
+    start: first angle of joint 1 [rad].
+    """
     drives = [{**SERVO, **drive, **friction} for drive in DRIVES[:joints]]
-    return Arm.model_validate({"start": (-math.pi / 2, 0.0)[:joints], "links": LINKS[:joints], "drives": drives})
+    return Arm.model_validate({"start": (start, 0.0)[:joints], "links": LINKS[:joints], "drives": drives})
 
 
 def wave(seed: int, peak: Sequence[float], period: float = PERIOD) -> Multisine:

@@ -274,7 +274,7 @@ def test_periods_that_are_alike_contain_no_change(
 
 @pytest.mark.parametrize("has_stop", [False, True])
 def test_a_stop_within_the_motion_is_a_cause(has_stop: bool) -> None:
-    arm = recorded_arm.servo_arm({"stops": (-1.75, 3.0), "stop_stiffness": 200.0} if has_stop else {}, joints=1)  # type: ignore[dict-item]
+    arm = recorded_arm.servo_arm({"stops": (-1.75, 3.0), "stop_stiffness": 200.0} if has_stop else {}, joints=1)
     period = recorded_arm.record(arm, recorded_arm.wave(1, (0.3,))).rounded()
     validation = validate(period, identify(period, Model(joints=1, friction="coulomb")))
     said = cause_of_residual(load_config(CONFIGS / "fake_pendulum.toml"), period, validation)

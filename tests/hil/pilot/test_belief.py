@@ -47,7 +47,7 @@ def test_what_an_arm_did_is_learned(config: Config) -> None:
     command, pose = commands(config, (0.5, 0.35)), np.array([-1.54, 0.05])
     position = respond(Physics.of(truth), resting(pose), command, 400.0, feedback_of(config)).position
     prior = prior_belief(config, 96)
-    belief = prior.after(config, Seen(command, np.round(position / 0.0015) * 0.0015, pose, pose))
+    belief = prior.after(config, Seen(command, command, np.round(position / 0.0015) * 0.0015, pose, pose))
     for name in ("gravity_1", "gravity_2", "inertia_1", "coulomb_1"):
         assert median(belief, name) == pytest.approx(truth[name], rel=0.12), name
         assert belief.spread(name) < 0.5 * prior.spread(name), name
@@ -56,7 +56,7 @@ def test_what_an_arm_did_is_learned(config: Config) -> None:
 
 def test_a_joint_that_stood_still_asks_for_friction_and_nothing_else(config: Config) -> None:
     command, pose = commands(config, (0.2, 0.12)), np.array([-1.57, 0.0])
-    seen = Seen(command, np.repeat(pose[:, None], command.shape[1], axis=1), pose, pose)
+    seen = Seen(command, command, np.repeat(pose[:, None], command.shape[1], axis=1), pose, pose)
     prior = prior_belief(config, 60)
     belief = prior.after(config, seen)
     for joint in (1, 2):

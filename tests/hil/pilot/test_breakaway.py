@@ -2,20 +2,23 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from hil.config.schema import Config, parse_config
+from hil.config.schema import Config, load_config, parse_config
 from hil.dry_run.amplitude import most_torque
 from hil.errors import Cause, DidNotMove, ExperimentError, NoSafeTorque, NotSettled, SafetyStop
 from hil.pilot import full
-from hil.pilot.breakaway import broke_free, narrowed, raised
+from hil.pilot.breakaway import broke_free, narrowed, raised, resting_on_stop
 from hil.pilot.options import PilotOptions
 from hil.pilot.search import Search
+from hil.pilot.seen import Seen
 from hil.pilot.steps import Played, Step, tells_of_the_arm
 from hil.runs.run_folder import RunFolder
+from tests.support import recorded_arm
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
@@ -265,3 +268,25 @@ def test_motion_that_never_repeats_ends_the_identification(config: Config, tmp_p
     with pytest.raises(SafetyStop, match="does not repeat"):
         full._full(search, config, found)
     assert search.play.call_count == OPTIONS.max_unlike_runs
+
+
+@pytest.mark.parametrize(
+    ("friction", "rest", "peak", "rests"),
+    [
+        ({"stops": (-0.8, 3.0), "stop_stiffness": 200.0}, -0.795, 0.45, True),
+        ({}, -np.pi / 2, 0.1, False),
+        ({"coulomb": 0.3, "stribeck_rise": 0.5, "stribeck_velocity": 0.2}, -0.8, 0.6, False),
+    ],
+    ids=["stop", "hangs", "friction"],
+)
+def test_an_arm_that_rests_on_a_stop_is_distinguished_from_one_that_friction_holds(
+    friction: dict[str, Any], rest: float, peak: float, rests: bool
+) -> None:
+    arm = recorded_arm.servo_arm(friction, joints=1, start=rest)
+    motion = recorded_arm.record(arm, recorded_arm.wave(1, (peak,), 5.0))
+    config = load_config(CONFIGS / "fake_pendulum.toml")
+    config = config.model_copy(update={"arm": config.arm.model_copy(update={"rest_pose": [rest]})})
+    position = motion.rounded().position
+    said = resting_on_stop(config, Seen(motion.torque, motion.torque, position, np.array([rest]), position[:, -1]))
+    assert said.startswith("Joint 'pendulum'") is rests and bool(said) is rests
+    assert ("rests on something that yields (a stop, a table or a cable) at -0.8" in said) is rests
