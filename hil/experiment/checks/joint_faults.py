@@ -10,6 +10,7 @@ from hil.drivers.servo_model import HARDLY_ANY, Mode
 from hil.drivers.state import State
 from hil.errors import Cause
 from hil.experiment.checks import joint_checks
+from hil.experiment.checks.swapped import SwappedReplies, swapped_advice
 from hil.experiment.status_check import StatusCheck
 from hil.plan.recent_motion import RecentMotion
 
@@ -41,6 +42,7 @@ class JointFaults:
     ) -> None:
         self._records, self._recent, self._status = records, recent, status
         self._lower_torque = lower_torque
+        self._swapped = SwappedReplies([joint.joint for joint in config.joints])
         self._constants = [joint.torque_per_goal for joint in config.joints]
         self._units = [joint.drive_mode.goal_unit for joint in config.joints]
         self._models = [joint.joint.servo if joint.drive_mode is Mode.CURRENT else None for joint in config.joints]
@@ -78,13 +80,19 @@ class JointFaults:
                 return self._out_of_voltage(index, goal, carried, velocity)
         return None
 
-    def _jumped(self, index: int, _: State) -> Fault:
+    def swapped(self, index: int, state: State) -> str:
+        """Explain a joint's change of angle by replies swapped with another servo's; "" if they are not."""
+        before = [self._recent.previous(joint) for joint in range(len(self._records))]
+        pair = self._swapped.look(index, state, before)
+        return "" if pair is None else swapped_advice(*pair)
+
+    def _jumped(self, index: int, state: State) -> Fault:
         joint = self._records[index]
+        check = "Check the encoder, its magnet and the supply, and whether its horn slips."
         return (
             Cause.JUMP,
             f"reports an angle that changed by {joint['moved']:+.3f} rad within {1e3 * joint['seconds']:.0f} ms; its "
-            f"velocity limit allows at most {joint['most']:.3f} rad. Check the encoder, its magnet and the supply, "
-            "and whether its horn slips.",
+            f"velocity limit allows at most {joint['most']:.3f} rad. {self.swapped(index, state) or check}",
         )
 
     def _outside(self, index: int, state: State) -> Fault:
