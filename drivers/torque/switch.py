@@ -42,6 +42,8 @@ class TorqueSwitch:
         self._armed: set[Joint] = set()
         """Servos whose Bus Watchdog has been armed and not disarmed since."""
         self.torque_off_report: TorqueOff | None = None
+        self.has_switched_on = False
+        """Whether this program has switched torque on since the port was opened."""
 
     @property
     def drives(self) -> Mapping[Joint, Servo]:
@@ -127,6 +129,7 @@ class TorqueSwitch:
             if watched:
                 servo.write("Bus Watchdog", ticks)
                 self._armed.add(joint)
+        self.has_switched_on = True
         for joint, servo in self._servos.items():
             try:
                 servo.write("Torque Enable", 1)
