@@ -231,10 +231,10 @@ class TorqueSwitch:
         self.torque_off_report = report.with_later(drive, rebooted=rebooted)
         return True
 
-    def _fault(self, drive: Joint, *, alone: bool = True) -> str:
-        """Return the fault of one servo as text, or "" if it reports none and another servo may have raised the alert.
+    def _fault(self, drive: Joint, *, its_own: bool = True) -> str:
+        """Return the fault of one servo as text, or "" if it reports none and another servo has raised the alert.
 
-        alone: whether this is the joint's only servo, so that the alert is certainly its own.
+        its_own: whether this servo has raised the alert.
         """
         try:
             error = self._servos[drive].hardware_error()
@@ -244,4 +244,4 @@ class TorqueSwitch:
         cuts = True
         with suppress(DriverError):
             cuts = not error or shuts_down(self._servos[drive], error)
-        return fault_text(drive, cause, shuts_down=cuts) if alone or error else ""
+        return fault_text(drive, cause, shuts_down=cuts) if its_own or error else ""

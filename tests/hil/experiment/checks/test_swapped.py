@@ -9,17 +9,15 @@ from unittest import mock
 import pytest
 
 import hil
-from hil.config.schema import Config
 from hil.drivers.exchange import Reply
 from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import Mode, servo_model
 from hil.drivers.state import Converter, State
 from hil.errors import Cause, SafetyStop
 from hil.experiment.checks.swapped import SwappedReplies
-from tests.support.edits import QUICK, replaced
+from tests.support.edits import QUICK, replaced, with_second_servo
 from tests.support.paths import CONFIGS
 
-Arm = Callable[..., Config]
 XM, XL = servo_model("XM430-W350"), servo_model("XL430-W250")
 ARM = (
     Joint("waist", 1, XM, 1, 2048, near=0.0),
@@ -96,13 +94,9 @@ def swapping(first: int, second: int, since: float) -> Callable[[Converter, tupl
 def test_a_run_names_the_two_servos_and_no_encoder(tmp_path: Path, servos: tuple[int, int]) -> None:
     text = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
     text = text.replace("zero_ticks = 2048", "zero_ticks = 2700")
-    joints, fake = text.split("[fake]", 1)
-    joints = joints.replace("id = 1\n", "id = [1, 3]\n", 1)
-    joints = joints.replace("direction = 1 ", "direction = [1, -1] #", 1)
-    joints = replaced(joints, ("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"), *QUICK)
-    shadow = '[[fake.servos]]\nid = 3\nmodel = "XM430-W350"\njoint = 1\ndirection = -1\nzero_ticks = 300\n'
+    short = ("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"), *QUICK
     arm = tmp_path / "arm.toml"
-    arm.write_text(f"{joints}[fake]{fake}\n{shadow}", encoding="utf-8")
+    arm.write_text(with_second_servo(replaced(text, *short), zero_ticks=300), encoding="utf-8")
     with (
         mock.patch.object(Converter, "state", swapping(*servos, since=4.0)),
         pytest.raises(SafetyStop) as stopped,
