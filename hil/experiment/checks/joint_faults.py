@@ -145,9 +145,9 @@ class JointFaults:
                 Cause.GOALS_CHANGED,
                 f"{said} at {velocity:.2f} rad/s: {self.supply[index]:.1f} V would drive the commanded current at "
                 "that speed, according to the published figures. Its goals are being altered in transit or by another "
-                "program, its supply sags, "
-                "or its current sensor is wrong: check these. If all are in order, its motor is weaker than published: "
-                f"lower velocity_limit to {BELOW_VOLTAGE * abs(velocity):.2g} rad/s.",
+                "program, its supply sags, a wire or contact of its motor is loose, or its current sensor is wrong: "
+                "check these. If all are in order, its motor is weaker than published: lower velocity_limit to "
+                f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s.",
             )
         seconds = self._records[index]["found"]
         return (
@@ -171,9 +171,10 @@ class JointFaults:
         return (
             Cause.OUT_OF_VOLTAGE,
             f"carries {carried:.3f} {unit} instead of the commanded {goal:.3f} {unit} at {velocity:.2f} rad/s: at that "
-            "speed its supply cannot drive more current against the back-EMF, or its current sensor is wrong. Lower "
-            f"velocity_limit to {BELOW_VOLTAGE * abs(velocity):.2g} rad/s, or raise the supply voltage; if this "
-            f"happens at lower speeds too, suspect the sensor.{self._lower_torque}",
+            "speed its supply cannot drive more current against the back-EMF, a wire or contact of its motor is loose, "
+            "or its current sensor is wrong. Check the motor's wiring first. If it is sound, lower velocity_limit to "
+            f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s, or raise the supply voltage; if this happens at lower speeds "
+            f"too, suspect the wiring or the sensor.{self._lower_torque}",
         )
 
     def _why_not_followed(self, index: int, state: State) -> str:
@@ -199,7 +200,9 @@ class JointFaults:
             return (
                 f"Its goals are being altered in transit or by another program, its current sensor is wrong, or {weak}"
             )
-        return f"Its torque is off, it was rebooted, its watchdog tripped, its current sensor is wrong, or {weak}"
+        # The applied voltage, which is measured in PWM mode, does not depend on the motor's wires.
+        wire = "" if self._models[index] is None else "a wire of its motor is broken, "
+        return f"Its torque is off, it was rebooted, its watchdog tripped, {wire}its current sensor is wrong, or {weak}"
 
     def _disagree(self, index: int, state: State) -> Fault:
         return (

@@ -6,7 +6,7 @@ import pytest
 
 import hil
 from hil.drivers.joint import Joint, SecondServo
-from hil.drivers.servo_model import servo_model
+from hil.drivers.servo_model import Mode, servo_model
 from hil.errors import Cause, SafetyStop
 from hil.experiment.checks.apart import ALLOWED_RAD, Apart, causes_of_standstill
 from tests.support.edits import QUICK, replaced, with_second_servo
@@ -44,6 +44,16 @@ def test_a_horn_that_slips_stops_the_arm_by_name(tmp_path: Path) -> None:
     with pytest.raises(SafetyStop, match=r"ID 3 has turned .0\.\d+ rad relative to the first") as stopped:
         hil.record(slips, out=tmp_path / "run")
     assert stopped.value.cause is Cause.APART
+
+
+@pytest.mark.parametrize(
+    ("model", "mode", "may_be_dead"),
+    [("XM430-W350", Mode.CURRENT, False), ("XM430-W350", Mode.PWM, True), ("XL430-W250", Mode.PWM, True)],
+)
+def test_a_dead_motor_is_named_where_its_current_is_not_measured(model: str, mode: Mode, may_be_dead: bool) -> None:
+    said = causes_of_standstill(Joint("hip", 2, servo_model(model), mode=mode))
+    assert ("its motor delivers no torque (a broken wire" in said) == may_be_dead
+    assert ("its gear does not transmit" in said) != may_be_dead
 
 
 @pytest.mark.parametrize("servo", [1, 3])
