@@ -93,6 +93,8 @@ class ServoBus(TorqueSwitch):
         """Number of exchanges per sample, chosen by `prepare` so that they are at most CHECK_S apart if possible."""
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._last_answers: Sequence[Answer] = ()
+        self._alerted: set[Joint] = set()
+        """Servos of joints with several that have set their alert bit in an exchange."""
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
@@ -311,7 +313,11 @@ class ServoBus(TorqueSwitch):
             raise overheard(f"has sent or requested {strangers} packets")
         if exchange.heard.mixed_up > MOST_MIXED_UP:
             raise WrongReply(exchange.heard.mixed_up_advice(self.port.url))
-        return fold(state, self._of, len(self.joints)) if self._in_pairs else state
+        if not self._in_pairs:
+            return state
+        if any(error & ALERT for error in state.error):
+            self._alerted |= {drive for drive, error in zip(self._drives, state.error, strict=True) if error & ALERT}
+        return fold(state, self._of, len(self.joints))
 
     def first_hides_others(self, patience: float) -> bool:
         """Return whether the first servo is silent although the last one replies. Raises PortLost.
@@ -408,7 +414,8 @@ class ServoBus(TorqueSwitch):
 
     def _faults(self, joint: Joint) -> str:
         """Describe the faults of a joint's servos after one of them has set its alert bit."""
-        texts = [self._fault(drive, alone=len(joint.drives) == 1) for drive in joint.drives]
+        alone = len(joint.drives) == 1
+        texts = [self._fault(drive, its_own=alone or drive in self._alerted) for drive in joint.drives]
         return " ".join(filter(None, texts))
 
 

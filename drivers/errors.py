@@ -25,11 +25,13 @@ class DriverError(Exception):
     """Base class of all errors raised by the servo drivers.
 
     last_samples: the last samples that an experiment recorded before the error, if one was running. in_doubt: the
-    registers that may not have been restored, if all others are known to have been restored.
+    registers that may not have been restored, if all others are known to have been restored. after_torque: whether
+    the error was found after torque had been switched on; then it is not wrong input.
     """
 
     last_samples: object = None
     in_doubt: tuple[str, ...] = ()
+    after_torque: bool = False
 
 
 class UnknownModel(DriverError):

@@ -42,6 +42,8 @@ class TorqueSwitch:
         self._armed: set[Joint] = set()
         """Servos whose Bus Watchdog has been armed and not disarmed since."""
         self.torque_off_report: TorqueOff | None = None
+        self.has_switched_on = False
+        """Whether this program has switched torque on since the port was opened."""
 
     @property
     def drives(self) -> Mapping[Joint, Servo]:
@@ -127,6 +129,7 @@ class TorqueSwitch:
             if watched:
                 servo.write("Bus Watchdog", ticks)
                 self._armed.add(joint)
+        self.has_switched_on = True
         for joint, servo in self._servos.items():
             try:
                 servo.write("Torque Enable", 1)
@@ -228,10 +231,10 @@ class TorqueSwitch:
         self.torque_off_report = report.with_later(drive, rebooted=rebooted)
         return True
 
-    def _fault(self, drive: Joint, *, alone: bool = True) -> str:
-        """Return the fault of one servo as text, or "" if it reports none and another servo may have raised the alert.
+    def _fault(self, drive: Joint, *, its_own: bool = True) -> str:
+        """Return the fault of one servo as text, or "" if it reports none and another servo has raised the alert.
 
-        alone: whether this is the joint's only servo, so that the alert is certainly its own.
+        its_own: whether this servo has raised the alert.
         """
         try:
             error = self._servos[drive].hardware_error()
@@ -241,4 +244,4 @@ class TorqueSwitch:
         cuts = True
         with suppress(DriverError):
             cuts = not error or shuts_down(self._servos[drive], error)
-        return fault_text(drive, cause, shuts_down=cuts) if alone or error else ""
+        return fault_text(drive, cause, shuts_down=cuts) if its_own or error else ""

@@ -28,11 +28,12 @@ def exit_code(error: Exception) -> int | None:
         return 2
     if isinstance(error, HilError):
         return error.exit_code
-    if isinstance(
-        error, driver.UnknownModel | driver.PortNotOpened | driver.WrongModel | driver.WrongSetting | PlantError
-    ):
+    if isinstance(error, driver.DriverError):
+        of_the_input = driver.UnknownModel | driver.PortNotOpened | driver.WrongModel | driver.WrongSetting
+        return 2 if isinstance(error, of_the_input) and not error.after_torque else 1
+    if isinstance(error, PlantError):
         return 2
-    return 1 if isinstance(error, driver.DriverError | EstimationError) else None
+    return 1 if isinstance(error, EstimationError) else None
 
 
 def _is_of_a_path(error: Exception) -> bool:

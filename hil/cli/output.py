@@ -16,6 +16,11 @@ from typing import Any
 PATIENCE_S = 3.0
 """Time after a signal within which a terminal or pipe must accept some output [s]; otherwise the rest is discarded."""
 
+_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that ask the program to end."""
+
+_UNHANDLED = (signal.SIG_DFL, signal.SIG_IGN, signal.default_int_handler)
+
 _PIECE, _POLL_S = 256, 0.1
 """Bytes per write (few, so that no write blocks for long), and interval between attempts to write [s]."""
 
@@ -50,13 +55,15 @@ def bounded_output() -> Iterator[None]:
     """Let the program end after a signal even if its terminal is stopped (Ctrl-S) or nobody reads its output.
 
     Until a signal arrives, output waits indefinitely. Only terminals and pipes are handled in this way, and only in
-    the main thread; the files of a run folder are completed and closed regardless.
+    the main thread; the files of a run folder are completed and closed regardless. If output had to be discarded, the
+    exit code is that of the signal: 128 plus its number.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     heard, told = os.pipe()
-    os.set_blocking(told, False)
+    for end in (heard, told):
+        os.set_blocking(end, False)
     former = signal.set_wakeup_fd(told, warn_on_full_buffer=False)
     streams = sys.stdout, sys.stderr
     patience = _Patience(heard)
@@ -71,6 +78,8 @@ def bounded_output() -> Iterator[None]:
         signal.set_wakeup_fd(former)
         os.close(heard)
         os.close(told)
+        if patience.has_discarded and patience.signal is not None:
+            sys.exit(128 + patience.signal)
 
 
 def _bounded(stream: Any, patience: "_Patience") -> Any:
@@ -90,19 +99,50 @@ def _bounded(stream: Any, patience: "_Patience") -> Any:
 class _Patience:
     """How long output waits for its reader: indefinitely until a signal arrives, `PATIENCE_S` from then on.
 
-    heard: file descriptor from which a byte can be read once a signal has arrived.
+    heard: non-blocking file descriptor from which the number of each signal that arrives can be read as a byte.
     """
 
     def __init__(self, heard: int) -> None:
         self._heard = heard
         self._since: float | None = None
         """Time of the signal or of the last write after it [s]; None before a signal."""
+        self.signal: int | None = None
+        """The first signal that asked the program to end."""
+        self.has_discarded = False
 
     def is_over(self) -> bool:
         """Whether output that cannot be written now is discarded."""
-        if self._since is None and select.select([self._heard], [], [], 0.0)[0]:
+        if self._since is None and self._has_heard():
             self._since = time.monotonic()
         return self._since is not None and time.monotonic() - self._since >= PATIENCE_S
+
+    def _has_heard(self) -> bool:
+        with suppress(BlockingIOError):
+            numbers = os.read(self._heard, _PIECE)
+            self.signal = next((each for each in numbers if each in _STOPPING), None)
+        return self.signal is not None
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """While output waits, let a signal that nothing else handles end the wait instead of the program.
+
+        This applies even if the signal was ignored when the program started, as shells do with Ctrl-C for background
+        jobs: nothing but the output is lost. A SIGHUP that is ignored (nohup) remains so.
+        """
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        former = {each: signal.getsignal(each) for each in _STOPPING}
+        taken = [each for each, handler in former.items() if handler in _UNHANDLED]
+        if former[signal.SIGHUP] is signal.SIG_IGN:
+            taken.remove(signal.SIGHUP)
+        try:
+            for each in taken:
+                signal.signal(each, lambda *_: None)  # Python writes its number to `heard`
+            yield
+        finally:
+            for each in taken:
+                signal.signal(each, former[each])
 
     def made_progress(self) -> None:
         """Restart the wait."""
@@ -128,12 +168,21 @@ class _Bounded(io.RawIOBase):
         return True
 
     def write(self, data: Any) -> int:
-        while not self._patience.is_over():
-            if select.select([], [self._number], [], _POLL_S)[1]:
-                written = os.write(self._number, data[:_PIECE])
-                self._patience.made_progress()
-                return written
-        return len(data)
+        if self._patience.has_discarded:  # more of it would leave a gap
+            return len(data)
+        if not self._is_ready(0.0):
+            with self._patience.listening():
+                while not self._is_ready(_POLL_S):
+                    if self._patience.is_over():
+                        self._patience.has_discarded = True
+                        return len(data)
+        written = os.write(self._number, data[:_PIECE])
+        self._patience.made_progress()
+        return written
+
+    def _is_ready(self, seconds: float) -> bool:
+        """Whether a piece can be written without blocking; waits at most this time [s]."""
+        return bool(select.select([], [self._number], [], seconds)[1])
 
 
 def _drop_output() -> None:

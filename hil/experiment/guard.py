@@ -170,7 +170,7 @@ class Guard:
                 self._stop(*self._faults.of(fault, state))
             self._silence.all_heard(now)
         if apart is not None and (turned := self._apart.look(apart)) is not None:
-            self._not_together(*turned)
+            self._not_together(*turned, state)
         if slow is not None:
             self._look_slow(slow)
             self._look_at_clocks(slow, now)
@@ -352,14 +352,14 @@ class Guard:
             return f"{shared}, and whether other programs keep this computer busy, since this program was running late."
         return f"{shared}."
 
-    def _not_together(self, index: int, servo: int, turned: float) -> NoReturn:
+    def _not_together(self, index: int, servo: int, turned: float, state: State) -> NoReturn:
         ids = self._seconds[index]
+        slips = "Its horn slips, a screw is loose, one of the encoders is wrong, or its direction setting is wrong."
         self._stop(
             index,
             Cause.APART,
             f"has servos that no longer turn together: ID {ids[servo]} has turned {turned:+.3f} rad relative to the "
-            "first one since the start. Its horn slips, a screw is loose, one of the encoders is wrong, or its "
-            "direction setting is wrong.",
+            f"first one since the start. {self._faults.swapped(index, state) or slips}",
         )
 
     def _look_at_clocks(self, slow: Slow, now: float) -> None:

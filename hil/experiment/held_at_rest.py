@@ -33,8 +33,8 @@ class HeldAtRest:
             if abs(at - pose) > self._allowed:
                 return index, (
                     f"moved before the start: it is {at - pose:+.3f} rad from its rest pose, where the stabiliser "
-                    f"should hold it within {self._allowed:.2f} rad. Check whether its motor is reversed (direction), "
-                    "whether a hand or a cable pushes it, whether its horn slips, and whether stabiliser.stiffness "
-                    "outweighs gravity."
+                    f"should hold it within {self._allowed:.2f} rad. Check whether its motor is reversed (direction) "
+                    "or delivers no torque (wires, gear), whether a hand or a cable pushes it, whether its horn slips, "
+                    "and whether stabiliser.stiffness outweighs gravity."
                 )
         return None

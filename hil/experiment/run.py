@@ -13,7 +13,7 @@ from hil.config.schema import Config
 from hil.drivers.adapter.latency import WANTED_MS, command_to_set, latency_timer, read_latency_ms
 from hil.drivers.bus import ServoBus
 from hil.drivers.clock import Clock, WallClock
-from hil.drivers.errors import DriverError, PortLost, ServoFault, TorqueNotOff, WrongSetting
+from hil.drivers.errors import BusShared, DriverError, PortLost, ServoFault, TorqueNotOff, WrongSetting
 from hil.drivers.servo import LATE
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
@@ -256,11 +256,15 @@ def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> 
 
 
 def _check_unchanged(bus: ServoBus) -> Settings:
-    """Check that the servos' settings have not changed since the arm's pose was checked; return them."""
+    """Check that the servos' settings have not changed since the session began; return them.
+
+    Raises BusShared if another program has changed any.
+    """
     before = {each: value for each, value in settings_at_start().items() if each[1] not in WRITTEN}
     now = settings_now(bus)
     if changed := changed_settings(before, now):
-        raise WrongSetting(f"{changed} Torque has not been switched on. Stop that program, then start again.")
+        again = " again after the previous run" if bus.has_switched_on else ""
+        raise BusShared(f"{changed} Torque has not been switched on{again}. Stop that program, then start again.")
     return now
 
 

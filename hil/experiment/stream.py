@@ -27,7 +27,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.estimator.data.periodicity import WARMEST, correlation_of_changes, decay_of
 from hil.experiment.chain_watch import ChainWatch
-from hil.experiment.checks.apart import opposed
+from hil.experiment.checks.apart import opposed, without_torque
 from hil.experiment.guard import Guard
 from hil.experiment.model_watch import ModelWatch
 from hil.experiment.pace import Pace
@@ -327,8 +327,9 @@ class Stream:
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
                 against = f" Or {opposed(joint)}" if joint.seconds else ""
                 raise DidNotMove(
-                    f"{joint.title} moved by only {way:.4f} rad in a whole period: it is stuck, or friction holds it."
-                    f"{against} Move it by hand with torque off; if it is free, {self._more_torque()}."
+                    f"{joint.title} moved by only {way:.4f} rad in a whole period: it is stuck, friction holds it, or "
+                    f"{without_torque(joint)}.{against} Move it by hand with torque off; if it is free, check its "
+                    f"wires and its gear, or {self._more_torque()}."
                 )
 
     def _more_torque(self) -> str:

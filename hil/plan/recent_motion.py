@@ -66,6 +66,11 @@ class RecentMotion:
         if not self._states or self._states[-1] is not state:
             self._states.append(state)
 
+    def previous(self, joint: int) -> State | None:
+        """Return the latest exchange before the newest one that the joint answered; None if there is none."""
+        earlier = (state for state in reversed(self._states) if state is not self._states[-1])
+        return next((state for state in earlier if not isnan(state.position[joint])), None)
+
     def until(self, state: State) -> "RecentMotion":
         """Return the motion up to `state`, an earlier exchange."""
         then = copy(self)

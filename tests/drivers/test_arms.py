@@ -14,7 +14,7 @@ from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.packet import HardwareError
 from hil.drivers.rate import FixedRate
 from hil.drivers.servo_model import Mode, servo_model
-from hil.fakes.bus.faults import Fault
+from hil.fakes.bus.faults import Fault, FaultKind
 from hil.fakes.description import FakeArm
 from hil.fakes.protocol_fake import FakeSerial, open_fake
 
@@ -86,6 +86,21 @@ def test_both_of_a_pair_are_watched(opened: Open) -> None:
         assert state.missing == (True, True)  # in a Sync Read, all servos after a silent one stay silent
         report = bus.torque_off()
         assert [str(joint) for joint, _ in report.unconfirmed] == ["joint 'shoulder' (ID 2, XM430-W350)"]
+
+
+@pytest.mark.parametrize("servo", [1, 2])
+def test_an_alert_of_a_pair_is_the_servo_s_that_raised_it_even_without_a_hardware_error(
+    opened: Open, servo: int
+) -> None:
+    bus, port = opened(arm(*PAIR), SHOULDER, ELBOW)
+    with bus:
+        port.bus.faults.add(Fault(kind=FaultKind.STATUS_ERROR, at=port.bus.time, servo=servo, amount=128.0))
+        state = bus.exchange([0.0, 0.0])
+        port.bus.faults.clear()
+        bus.exchange([0.0, 0.0])  # as while an arm is lowered
+        with pytest.raises(ServoFault, match=rf"^Joint 'shoulder' \(ID {servo}, .*no hardware error now") as fault:
+            bus.check_alerts(state)
+        assert str(fault.value).count("raised its alert") == 1
 
 
 def test_slow_registers_of_a_pair(opened: Open) -> None:

@@ -25,3 +25,11 @@ def replaced(text: str, *changes: tuple[str, str]) -> str:
         assert old in text, f"{old!r} is not in the text"
         text = text.replace(old, new, 1)
     return text
+
+
+def with_second_servo(text: str, zero_ticks: int = 1000) -> str:
+    """The text of a fake arm with a second, mirrored servo on its first joint: ID 3."""
+    joints, fake = text.split("[fake]", 1)
+    joints = replaced(joints, ("id = 1\n", "id = [1, 3]\n"), ("direction = 1 ", "direction = [1, -1] #"))
+    second = f'id = 3\nmodel = "XM430-W350"\njoint = 1\ndirection = -1\nzero_ticks = {zero_ticks}\n'
+    return f"{joints}[fake]{fake}\n[[fake.servos]]\n{second}"

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from math import isnan
 
 from hil.drivers.joint import Joint
+from hil.drivers.servo_model import Mode
 
 ALLOWED_RAD = 0.1
 """Allowed change of the difference between the angles of two servos [rad], for backlash of both gear trains, encoder
@@ -24,11 +25,23 @@ def opposed(joint: Joint) -> str:
     return f"its two servos work against each other: is one entry of direction = {signs} wrong?"
 
 
+def without_torque(joint: Joint) -> str:
+    """Say why a joint may get no torque although nothing is reported.
+
+    A broken wire or winding shows in the motor current, which the guard compares with its goal, but not in the applied
+    voltage or in the supply current.
+    """
+    if joint.mode is Mode.CURRENT and not joint.servo.senses_supply:
+        return "its gear does not transmit the motor's torque"
+    return "its motor delivers no torque (a broken wire or motor, or a stripped gear)"
+
+
 def causes_of_standstill(joint: Joint) -> str:
     """Say why a joint that should move may stand still."""
+    said = f"Something is blocking it, {without_torque(joint)}"
     if asked := opposed(joint):
-        return f"Something is blocking it, its encoder is frozen, or {asked}"
-    return "Something is blocking it, or its encoder is frozen."
+        return f"{said}, its encoder is frozen, or {asked}"
+    return f"{said}, or its encoder is frozen."
 
 
 class Apart:

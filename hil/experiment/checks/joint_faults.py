@@ -10,6 +10,7 @@ from hil.drivers.servo_model import HARDLY_ANY, Mode
 from hil.drivers.state import State
 from hil.errors import Cause
 from hil.experiment.checks import joint_checks
+from hil.experiment.checks.swapped import SwappedReplies, swapped_advice
 from hil.experiment.status_check import StatusCheck
 from hil.plan.recent_motion import RecentMotion
 
@@ -41,6 +42,7 @@ class JointFaults:
     ) -> None:
         self._records, self._recent, self._status = records, recent, status
         self._lower_torque = lower_torque
+        self._swapped = SwappedReplies([joint.joint for joint in config.joints])
         self._constants = [joint.torque_per_goal for joint in config.joints]
         self._units = [joint.drive_mode.goal_unit for joint in config.joints]
         self._models = [joint.joint.servo if joint.drive_mode is Mode.CURRENT else None for joint in config.joints]
@@ -78,13 +80,19 @@ class JointFaults:
                 return self._out_of_voltage(index, goal, carried, velocity)
         return None
 
-    def _jumped(self, index: int, _: State) -> Fault:
+    def swapped(self, index: int, state: State) -> str:
+        """Explain a joint's change of angle by replies swapped with another servo's; "" if they are not."""
+        before = [self._recent.previous(joint) for joint in range(len(self._records))]
+        pair = self._swapped.look(index, state, before)
+        return "" if pair is None else swapped_advice(*pair)
+
+    def _jumped(self, index: int, state: State) -> Fault:
         joint = self._records[index]
+        check = "Check the encoder, its magnet and the supply, and whether its horn slips."
         return (
             Cause.JUMP,
             f"reports an angle that changed by {joint['moved']:+.3f} rad within {1e3 * joint['seconds']:.0f} ms; its "
-            f"velocity limit allows at most {joint['most']:.3f} rad. Check the encoder, its magnet and the supply, "
-            "and whether its horn slips.",
+            f"velocity limit allows at most {joint['most']:.3f} rad. {self.swapped(index, state) or check}",
         )
 
     def _outside(self, index: int, state: State) -> Fault:
@@ -137,9 +145,9 @@ class JointFaults:
                 Cause.GOALS_CHANGED,
                 f"{said} at {velocity:.2f} rad/s: {self.supply[index]:.1f} V would drive the commanded current at "
                 "that speed, according to the published figures. Its goals are being altered in transit or by another "
-                "program, its supply sags, "
-                "or its current sensor is wrong: check these. If all are in order, its motor is weaker than published: "
-                f"lower velocity_limit to {BELOW_VOLTAGE * abs(velocity):.2g} rad/s.",
+                "program, its supply sags, a wire or contact of its motor is loose, or its current sensor is wrong: "
+                "check these. If all are in order, its motor is weaker than published: lower velocity_limit to "
+                f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s.",
             )
         seconds = self._records[index]["found"]
         return (
@@ -163,9 +171,10 @@ class JointFaults:
         return (
             Cause.OUT_OF_VOLTAGE,
             f"carries {carried:.3f} {unit} instead of the commanded {goal:.3f} {unit} at {velocity:.2f} rad/s: at that "
-            "speed its supply cannot drive more current against the back-EMF, or its current sensor is wrong. Lower "
-            f"velocity_limit to {BELOW_VOLTAGE * abs(velocity):.2g} rad/s, or raise the supply voltage; if this "
-            f"happens at lower speeds too, suspect the sensor.{self._lower_torque}",
+            "speed its supply cannot drive more current against the back-EMF, a wire or contact of its motor is loose, "
+            "or its current sensor is wrong. Check the motor's wiring first. If it is sound, lower velocity_limit to "
+            f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s, or raise the supply voltage; if this happens at lower speeds "
+            f"too, suspect the wiring or the sensor.{self._lower_torque}",
         )
 
     def _why_not_followed(self, index: int, state: State) -> str:
@@ -191,7 +200,9 @@ class JointFaults:
             return (
                 f"Its goals are being altered in transit or by another program, its current sensor is wrong, or {weak}"
             )
-        return f"Its torque is off, it was rebooted, its watchdog tripped, its current sensor is wrong, or {weak}"
+        # The applied voltage, which is measured in PWM mode, does not depend on the motor's wires.
+        wire = "" if self._models[index] is None else "a wire of its motor is broken, "
+        return f"Its torque is off, it was rebooted, its watchdog tripped, {wire}its current sensor is wrong, or {weak}"
 
     def _disagree(self, index: int, state: State) -> Fault:
         return (

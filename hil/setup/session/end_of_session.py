@@ -67,13 +67,15 @@ def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
 @contextmanager
 def telling_of_torque(bus: ServoBus) -> Iterator[None]:
     """Add a note about torque to any exception that ends the block, unless it already has one: a stop may also occur
-    between two runs.
+    between two runs. Mark a DriverError that ends the block after this program has switched torque on.
     """
     try:
         yield
     except TorqueNotOff:
         raise
     except BaseException as ended:
+        if isinstance(ended, DriverError):
+            ended.after_torque = bus.has_switched_on
         is_stop = isinstance(ended, KeyboardInterrupt | HilError | DriverError)
         told = any(_TELLS_OF_TORQUE.search(note) for note in getattr(ended, "__notes__", []))
         if not told and (is_stop or bus.torque_off_report is not None):

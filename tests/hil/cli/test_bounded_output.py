@@ -3,11 +3,13 @@
 import os
 import pty
 import signal
+import subprocess
 import sys
 import termios
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +17,9 @@ import pytest
 
 from hil.cli import output
 from hil.cli.output import bounded_output
+from hil.runs.recording import load_samples
+from tests.support.edits import QUICK
+from tests.support.paths import ROOT
 
 TEXT = "x" * 79 + "\n"
 
@@ -54,10 +59,11 @@ def test_output_that_nobody_reads_is_discarded_after_a_signal_only(
         termios.tcflow(reader.writing, termios.TCOOFF)
     threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start()
     began = time.monotonic()
-    with bounded_output():
+    with pytest.raises(SystemExit) as ended, bounded_output():
         for _ in range(2000):
             print(TEXT, end="")
         print("last words", file=sys.stderr)
+    assert ended.value.code == 128 + signal.SIGTERM
     assert 0.5 < time.monotonic() - began < 5.0
 
 
@@ -82,3 +88,66 @@ def test_files_and_captured_streams_are_left_as_they_are(monkeypatch: pytest.Mon
         monkeypatch.setattr(sys, "stderr", fake := SimpleNamespace(flush=lambda: None))
         with bounded_output():
             assert sys.stdout is file and sys.stderr is fake
+
+
+@pytest.fixture
+def full_pipe() -> Iterator[tuple[int, int]]:
+    """A pipe that holds as much as it can: its reading end, open but idle, and its writing end."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writing, b"x" * 512)
+    os.set_blocking(writing, True)
+    yield reading, writing
+    for end in (reading, writing):
+        with suppress(OSError):
+            os.close(end)
+
+
+def recorded(arm: Path, out: Path, pipe: int, ignored: str = "") -> subprocess.Popen[bytes]:
+    """A process that records a run with this pipe as its standard streams, and has come to its last words.
+
+    ignored: names of signals that are ignored from the start, as shells do for background jobs.
+    """
+    words = [sys.executable, "-m", "hil", "record", str(arm), "--out", str(out)]
+    shell = ["sh", "-c", f"trap '' {ignored}; exec \"$@\"", "sh"] if ignored else []
+    process = subprocess.Popen([*shell, *words], stdout=pipe, stderr=pipe, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    events = out / "events.jsonl"
+    while not (events.is_file() and '"stopped: ' in events.read_text(encoding="utf-8")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    return process
+
+
+JUMPS = ("[fake]\n", '[[fake.faults]]\nkind = "encoder_jump"\nservo = 2\nat = 3.0\namount = 500\n\n[fake]\n')
+
+
+@pytest.mark.parametrize(("number", "ignored"), [(signal.SIGINT, "INT"), (signal.SIGINT, ""), (signal.SIGTERM, "")])
+def test_a_stopped_run_whose_last_words_nobody_reads_ends_at_a_signal(
+    arm_file: Callable[..., Path], tmp_path: Path, full_pipe: tuple[int, int], number: signal.Signals, ignored: str
+) -> None:
+    process = recorded(arm_file(*QUICK, JUMPS), tmp_path / "run", full_pipe[1], ignored)
+    try:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.5)  # without a signal, it waits for its reader
+        process.send_signal(number)
+        assert process.wait(60.0) == 128 + number
+    finally:
+        process.kill()
+        process.wait()
+    assert len(load_samples(tmp_path / "run" / "samples.npy", 2)) > 100
+    assert "Torque is off on both servos" in (tmp_path / "run" / "events.jsonl").read_text(encoding="utf-8")
+
+
+def test_a_reader_that_begins_late_gets_all_last_words(
+    arm_file: Callable[..., Path], tmp_path: Path, full_pipe: tuple[int, int]
+) -> None:
+    process = recorded(arm_file(*QUICK, JUMPS), tmp_path / "run", full_pipe[1])
+    os.close(full_pipe[1])
+    said = b""
+    while piece := os.read(full_pipe[0], 4096):
+        said += piece
+        time.sleep(0.01)
+    assert process.wait(60.0) == 1
+    assert said.lstrip(b"x").startswith(b"hil: Joint") and b"\nNext: hil check" in said

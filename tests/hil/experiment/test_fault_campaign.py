@@ -23,7 +23,10 @@ from benchmarks.fault_campaign.judge import (
 from benchmarks.fault_campaign.twin import has_healthy_twin, lagging, wired_otherwise
 from benchmarks.fault_campaign.witness import CURRENT_MODE, PWM_MODE, Witness
 from benchmarks.faults import campaign, figures
-from hil.drivers.servo_model import Mode
+from hil.drivers.joint import Joint
+from hil.drivers.servo_model import Mode, servo_model
+from hil.experiment.checks.apart import causes_of_standstill
+from hil.experiment.checks.swapped import swapped_advice
 from hil.experiment.status_check import OLD_REPLIES
 
 INJECTIONS = 300
@@ -99,6 +102,8 @@ NO_TORQUE = "carries 0.000 instead of the commanded 0.300. Its torque is off."
 UNLIKE_ANY = (
     "does not move like any arm consistent with the data. Its encoder has failed, something is pushing or holding it."
 )
+SWAPPED = f"reports an angle that changed by 0.3 rad within 5 ms. {swapped_advice(1, 2)}"
+STANDSTILL = causes_of_standstill(Joint("elbow", 2, servo_model("XL430-W250"), mode=Mode.PWM))
 TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
 
 
@@ -119,6 +124,10 @@ TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
         (Kind.WATCHDOG_LONG, "state", "stops by itself later than intended: its Bus Watchdog reads 127", JUMP),
         (Kind.SHADOWED, "state", "changed the settings (Secondary(Shadow) ID is 1 and was 255)", TWICE),
         (Kind.IDS_SWAPPED, "state", "Requests to ID 1 are answered by ID 2: the servos' IDs are mixed up.", TWICE),
+        (Kind.WEAK, "state", f"is not moving. {STANDSTILL}", CONTRADICTION),
+        (Kind.OBSTACLE, "state", f"is not moving. {STANDSTILL}", NO_TORQUE),
+        (Kind.IDS_SWAPPED, "state", SWAPPED, TWICE),
+        (Kind.SWAP, "state", SWAPPED, TWICE),
         (Kind.LAG, "velocity", "is at 1 rad, outside its position limit", "Lower velocity_limit, or raise the voltage"),
     ],
 )

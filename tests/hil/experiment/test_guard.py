@@ -590,7 +590,10 @@ def test_a_current_behind_its_goal_near_no_load_speed_is_the_supplys(
         for state in states:
             guard.look(state)
     assert stop.value.cause is cause
-    assert ("Lower velocity_limit" in str(stop.value)) == (cause is Cause.OUT_OF_VOLTAGE)
+    said = str(stop.value)
+    assert ("lower velocity_limit" in said) == (cause is Cause.OUT_OF_VOLTAGE)
+    if cause is Cause.OUT_OF_VOLTAGE:
+        assert said.index("Check the motor's wiring first") < said.index("lower velocity_limit")
 
 
 @pytest.mark.parametrize(

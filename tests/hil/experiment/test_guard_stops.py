@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 import serial
 
+from hil.cli.errors import exit_code
 from hil.config.schema import Config, parse_config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import BusShared, TorqueNotOff, WrongModel, WrongSetting
+from hil.drivers.errors import BusShared, DriverError, TorqueNotOff, WrongModel, WrongSetting
 from hil.errors import Cause, DidNotMove, ExperimentError, SafetyStop, StopRequested
 from hil.experiment import run
 from hil.experiment.checks import work
@@ -372,7 +373,7 @@ def test_settings_changed_before_torque_comes_on_are_refused(
 
     monkeypatch.setattr(run, "_write_facts", shift)
     config = arm()
-    with pytest.raises(WrongSetting, match=r"'elbow'.*Homing Offset from 0 to 30\)\. Torque has not been switched"):
+    with pytest.raises(BusShared, match=r"'elbow'.*Homing Offset from 0 to 30\)\. Torque has not been switched"):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
     assert_stopped(ports[0])
 
@@ -382,9 +383,50 @@ def test_an_offset_changed_before_the_pose_is_checked_is_named_not_its_effect(
 ) -> None:
     monkeypatch.setattr(run, "_check_rate", lambda *_: ports[0].bus.servos[2].memory.set("Homing Offset", 60))
     config = arm()
-    with pytest.raises(WrongSetting, match=r"'elbow'.*Homing Offset from 0 to 60\)\. Torque has not been switched"):
+    with pytest.raises(BusShared, match=r"'elbow'.*Homing Offset from 0 to 60\)\. Torque has not been switched"):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
     assert_stopped(ports[0])
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "kind", "said"),
+    [
+        (
+            "Status Return Level",
+            1,
+            BusShared,
+            "Status Return Level from 2 to 1). Torque has not been switched on",
+        ),
+        ("Drive Mode", 8, WrongSetting, "Drive Mode is 8"),
+    ],
+)
+@pytest.mark.parametrize("runs", [0, 1])
+def test_what_is_found_on_the_bus_after_a_run_is_no_wrong_input(
+    arm: Arm,
+    tmp_path: Path,
+    ports: list[Any],
+    plan: Plan,
+    register: str,
+    value: int,
+    kind: type[DriverError],
+    said: str,
+    runs: int,
+) -> None:
+    """runs: number of runs of the same command before another program changes a servo."""
+    config = arm()
+
+    def play(number: int) -> None:
+        run_experiment(config, RunFolder.create(tmp_path / f"{number}", config), config.path, lambda _: None, plan)
+
+    with pytest.raises(kind) as stop, servo_session.servo_session(config):
+        for number in range(runs):
+            play(number)
+        ports[0].bus.servos[2].memory.set(register, value)
+        play(runs)
+    assert said in str(stop.value)
+    assert ("on again after the previous run" in str(stop.value)) == (kind is BusShared and runs > 0)
+    assert ("has not switched it on" in "".join(stop.value.__notes__)) == (runs == 0)
+    assert exit_code(stop.value) == (2 if kind is WrongSetting and runs == 0 else 1)
 
 
 @pytest.mark.parametrize(("where", "after"), [(servo_session, "others_on_the_bus"), (run, "_check_pose")])
