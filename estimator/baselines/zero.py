@@ -37,9 +37,9 @@ def turned_zeros(recordings: Sequence[Recording]) -> Array | None:
     except EstimationError:
         return None
     both = np.concatenate((plain, sines), axis=1)
-    (_, left), (found, left_turned) = (_solved(A, tau) for A in (plain, both))
+    (upright, left), (found, left_turned) = (_solved(A, tau) for A in (plain, both))
     if left_turned > EXPLAINED * left:
-        return None
+        return _half_turns(upright[gravity], SURE * float(np.abs(tau).max()))
     cosine, sine = found[gravity], found[len(names) :]
     size = np.hypot(cosine, sine)
     if size[0] < SURE * float(np.abs(tau).max()):
@@ -55,6 +55,19 @@ def turned_zeros(recordings: Sequence[Recording]) -> Array | None:
         if _solved(*_rows(recordings, simple))[1] < TIE * left_turned:
             return np.asarray(simple)
     return np.asarray(zeros)
+
+
+def _half_turns(weights: Array, least: float) -> Array | None:
+    """Return zeros (joints,) [rad], 0 or half a turn, that make gravity torques positive; None if these already are.
+
+    weights: torque of gravity in a horizontal pose, by joint (joints,) [N m]. Smaller ones than `least` have no sign.
+    """
+    angle, angles = 0.0, []
+    for weight in weights.tolist():
+        angle = angle if abs(weight) < least else 0.0 if weight > 0.0 else np.pi
+        angles.append(angle)
+    zeros = np.abs(np.diff(angles, prepend=0.0))
+    return zeros if zeros.any() else None
 
 
 def _rows(recordings: Sequence[Recording], zeros: Array) -> tuple[Array, Array]:

@@ -73,6 +73,10 @@ BEYOND_SPEEDS = 3.0
 """Stribeck velocity, as a multiple of a joint's highest speed, for which the Stribeck rise falls by at most a tenth
 within the recorded range of speeds.
 """
+WIDEST_STEP = 0.3
+"""Width of the Coulomb friction step, as a multiple of a joint's highest speed, above which it could not be told from
+viscous friction.
+"""
 
 
 @dataclass(frozen=True)
@@ -181,7 +185,7 @@ _DECLARED = (
         range="floor",
         scale=0.05,
         absent=1.0,
-        fastest=BEYOND_SPEEDS,
+        fastest=WIDEST_STEP,
         standstill=True,
         replaced_by="presliding",
     ),

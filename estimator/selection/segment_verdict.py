@@ -69,16 +69,25 @@ class SegmentEvidence:
 def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool = True) -> dict[str, float]:
     """Return the relative standard error of each base parameter except offsets and, without gravity, gravity torques.
 
-    If gravity is negligible, errors of gravity torques are relative to the fraction LITTLE_TORQUE of the RMS torque.
+    A parameter may be zero, such as the dry friction of an ideal joint. If its torque is negligible, its error is
+    relative to the fraction LITTLE_TORQUE of the RMS torque.
     """
     torque = LITTLE_TORQUE * np.sqrt(np.mean([np.mean(each.torque**2, axis=1) for each in recordings], axis=0))
+    speed = np.sqrt(np.mean([np.mean(_velocity(each) ** 2, axis=1) for each in recordings], axis=0))
     relative = {}
     for name, value, std in zip(estimate.model.base_names, estimate.value, estimate.std, strict=False):
-        if kind_of(name) != "offset" and (gravity or kind_of(name) != "gravity"):
-            least = float(torque[(joint_of(name) or 1) - 1]) if kind_of(name) == "gravity" else 0.0
+        kind, joint = kind_of(name), (joint_of(name) or 1) - 1
+        if kind != "offset" and (gravity or kind != "gravity"):
+            least = float(torque[joint]) if kind in {"gravity", "coulomb"} else 0.0
+            least = float(torque[joint] / max(speed[joint], 1e-9)) if kind == "viscous" else least
             size = max(abs(float(value)), least)
             relative[name] = float(std) / size if size else np.inf
     return relative
+
+
+def _velocity(recording: Recording) -> Array:
+    """Return velocities, smoothed by the distance over ten samples (joints, samples) [rad/s]."""
+    return np.asarray(np.gradient(recording.filled(), axis=1)) / recording.interval
 
 
 def explains_well(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool = True) -> bool:
@@ -168,7 +177,8 @@ def _left(estimate: ShootingEstimate, evidence: SegmentEvidence) -> str:
     if left[joint] <= MUCH_LEFT and evidence.held_out is not None:
         said += f" (up to {MUCH_LEFT:g} times is acceptable if other motion is predicted well)"
     said += "."
-    seen = [each for each in evidence.candidates if each.evidence > 1.0 and each.explained > NOTICEABLE]
+    # A linear estimate of more than the whole residual means that the term is not small: its effect is unknown.
+    seen = [each for each in evidence.candidates if each.evidence > 1.0 and NOTICEABLE < each.explained <= 1.0]
     if seen:
         part = seen[0].part.replace("_", " ")
         article = "an" if part[0] in "aeiou" else "a"

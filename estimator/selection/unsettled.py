@@ -194,6 +194,7 @@ class _Search:
         """Return the choice: `best`, or the simplest model if it predicts held-out segments much better. If no model
         explains the motion, any improvement suffices.
         """
+        best = self._with_standard_errors(best, plain)
         simple = Model(plain.model.joints, "coulomb", plain.model.drive)
         plainest, chosen = self.trial(plain, simple), self.trial(best, best.model)
         ratio = self._options.overrule_ratio if _left(best) < EXPLAINED else 1.0
@@ -202,6 +203,16 @@ class _Search:
         if not np.isfinite(chosen.score):
             raise ConvergenceError("no friction model could be fitted to half of the segments: record for longer")
         return SegmentChoice(tuple(self._trials.values()), chosen, best, plain)
+
+    def _with_standard_errors(self, best: ShootingEstimate, plain: ShootingEstimate) -> ShootingEstimate:
+        """Return `best`, or a simpler estimate if no parameter of `best` has a standard error, as with extremely stiff
+        bristles.
+        """
+        for model in (best.model, best.model.without("presliding"), plain.model):
+            found = best if model == best.model else self.fit(model, plain)
+            if found is not None and np.isfinite(found.std).any():
+                return found
+        return best
 
     def _seen(self, estimate: ShootingEstimate) -> bool:
         found = missing_terms(self._recordings, estimate)

@@ -44,6 +44,7 @@ JUMPED = (
     "A position jumped (see the warnings), so angles before and after the jump are inconsistent: use only the part "
     "before or after it, or put each part in a separate file."
 )
+LAG_S = 1e-3  # lag of a motor's current behind its voltage; that of small motors is 0.1 to 2 ms
 NOT_HERE = ("ripple", "cogging", "encoder")
 
 
@@ -77,6 +78,8 @@ class Given:
     origin: tuple[float, ...] = ()
     repeats: bool = False
     length: float | None = None
+    brakes: tuple[float | None, ...] = ()
+    """Viscous friction of each voltage-driven joint that is due to back-EMF [N m s/rad]; None if it is not known."""
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
@@ -128,7 +131,7 @@ def estimate_any(
     began = time.perf_counter()
     start = _start(recordings)
     estimate, choice, held_out = _fitted(recordings, wanted, start, segment, zeros)
-    estimate = considered(recordings, estimate)
+    estimate = _with_late_back_emf(considered(recordings, estimate), given.brakes)
     predicted = predicted_positions(recordings, estimate)
     plain = estimate if choice is None else choice.plain
     fitted = Fitted(recordings, given.names, predicted, plain, estimate, gravity, given.repeats)
@@ -150,6 +153,20 @@ def estimate_any(
     for warning in result.warnings:
         log.warning("%s: %s", shown_path, warning)
     return Estimated(result, predicted, estimate)
+
+
+def _with_late_back_emf(estimate: ShootingEstimate, brakes: Sequence[float | None]) -> ShootingEstimate:
+    """Widen the standard errors of the inertias that the lag of voltage-driven motors' currents lowers.
+
+    The back-EMF of such a motor brakes its joint a little late, so the inertia appears smaller by brake times lag. A
+    recording does not state the lag, and hardly shows it.
+    """
+    covariance = estimate.covariance.copy()
+    for joint, brake in enumerate(brakes, 1):
+        viscous = max(estimate.parameters[f"viscous_{joint}"], 0.0)
+        place = estimate.names.index("inertia_1" if joint == 1 else "armature_2")
+        covariance[place, place] += (LAG_S * (viscous if brake is None else brake)) ** 2
+    return replace(estimate, covariance=covariance)
 
 
 def _judged(fitted: Fitted, given: Given, why: tuple[str, ...], held_out: Array | None, found: Doubts) -> Verdict:

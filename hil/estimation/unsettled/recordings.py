@@ -67,7 +67,8 @@ def _estimate_planar(
     if lengths is not None and len(lengths) != joints:
         raise ConfigError(f"{shown}: arm.link_lengths: give one length per position column ({joints}).")
     length = link_length(config.known, config.arm)
-    given = Given(names=read.names, jumps=jumps, origin=tuple(columns.zero or ()), repeats=repeats, length=length)
+    origin, brakes = tuple(columns.zero or ()), _brakes(columns)
+    given = Given(names=read.names, jumps=jumps, origin=origin, repeats=repeats, length=length, brakes=brakes)
     found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped, given)
     result = _doubted(_named(found, read, config), read)
     if config.known is not None:
@@ -186,6 +187,18 @@ def _named(found: Estimated, read: Converted, config: RecordingConfig) -> Shooti
     return replace(result, recordings=read.names, zeros=zeros, arm=arm, notes=tuple(notes))
 
 
+def _brakes(columns: Columns) -> tuple[float | None, ...]:
+    """Return the viscous friction due to each joint's back-EMF [N m s/rad]; None if its torque constant is not known,
+    and nothing if the joints are not driven by voltage.
+    """
+    gains, constants = columns.gains, columns.torque_constant
+    if columns.drive not in {"voltage", "pwm"} or gains is None:
+        return ()
+    if constants is None:
+        return (None,) * len(gains)
+    return tuple(gain * constant for gain, constant in zip(gains, constants, strict=True))
+
+
 def _back_emf(columns: Columns, result: ShootingResult) -> list[str]:
     """State how much of the viscous friction of voltage-driven joints is due to back-EMF."""
     gains = columns.gains
@@ -194,8 +207,8 @@ def _back_emf(columns: Columns, result: ShootingResult) -> list[str]:
     if columns.torque_constant is None:
         return ["The joints are driven by voltage, so viscous friction includes braking by back-EMF."]
     parts = [
-        f"{gain * constant:.3g} of {result.parameters[f'viscous_{joint + 1}'].value:.3g} N m s/rad in joint {joint + 1}"
-        for joint, (gain, constant) in enumerate(zip(gains, columns.torque_constant, strict=True))
+        f"{brake:.3g} of {result.parameters[f'viscous_{joint}'].value:.3g} N m s/rad in joint {joint}"
+        for joint, brake in enumerate(_brakes(columns), 1)
     ]
     return [f"The joints are driven by voltage, so viscous friction includes braking by back-EMF: {', '.join(parts)}."]
 

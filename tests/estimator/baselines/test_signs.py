@@ -121,3 +121,16 @@ def test_quarter_turns_are_preferred_to_an_angle_that_explains_hardly_more() -> 
     hanging = motion.position + np.array([[np.pi / 2], [0.0]])
     zeros = turned_zeros([Recording(motion.time, torque, hanging, np.full(2, 1.5e-3), between="held")])
     np.testing.assert_allclose(zeros, [-np.pi / 2, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("turned", [(0.0, 0.0), (np.pi, 0.0), (0.0, np.pi), (np.pi, np.pi)])
+def test_an_origin_that_is_half_a_turn_off_is_found_from_the_sign_of_gravity(turned: tuple[float, float]) -> None:
+    """No residual shows it, because the weights may be negative."""
+    motion = two_joints(8.0)
+    position = motion.position + np.array(turned)[:, None]
+    zeros = turned_zeros([Recording(motion.time, motion.torque, position, np.full(2, 1.5e-3), between="held")])
+    if turned == (0.0, 0.0):
+        assert zeros is None
+        return
+    assert zeros is not None
+    np.testing.assert_allclose(np.cos(zeros + turned), 1.0, atol=1e-12)

@@ -13,6 +13,8 @@ from hil.estimator.errors import RecordingError, ShapeError, StandstillError
 from hil.estimator.fit.multiple_shooting import Shooting, estimate_by_shooting
 from hil.estimator.fit.segmented_least_squares import Segmented
 from hil.estimator.models.model import Model
+from hil.estimator.options import SelectionOptions
+from hil.estimator.selection import unsettled
 from hil.estimator.selection.prediction import prediction_rms
 from hil.estimator.selection.pruning import pruned_model
 from hil.estimator.selection.segments import considered, held_out_errors, missing_terms
@@ -272,3 +274,15 @@ def test_recordings_that_disagree_make_all_less_certain() -> None:
     grown = [np.diag(found.covariance(groups) / found.covariance()) for found in (alone, alike)]
     assert grown[0].max() < 2.5
     assert grown[1].min() > 4.0
+
+
+def test_a_richer_model_without_standard_errors_is_not_kept(pendulum: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = swing(pendulum, 6.0, 5)
+    plain = estimate_by_shooting([recorded], Model(1), start(recorded))
+    nothing = replace(plain, model=plain.model.having("presliding"), covariance=np.full_like(plain.covariance, np.inf))
+    search = unsettled._Search([recorded], start(recorded), 1.0, False, SelectionOptions(), None)
+    monkeypatch.setattr(search, "fit", lambda model, _: plain if model == plain.model else None)
+    assert search._with_standard_errors(nothing, plain) is plain
+    assert search._with_standard_errors(plain, nothing) is plain
+    monkeypatch.setattr(search, "fit", lambda *_: None)
+    assert search._with_standard_errors(nothing, plain) is nothing, "better than no estimate"

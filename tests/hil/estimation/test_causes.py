@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +14,7 @@ from hil.config.schema import load_config
 from hil.estimation.settled_causes import cause_of_residual
 from hil.estimation.unsettled import causes as looked_for
 from hil.estimation.unsettled.causes import Fitted, causes
+from hil.estimation.unsettled.estimate import _with_late_back_emf
 from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.torque_faults import suspect_clipped, suspect_stop
 from hil.estimator.data.recording import Recording
@@ -26,6 +27,15 @@ from tests.support.paths import CONFIGS
 from tests.support.recorded_motion import two_joints
 
 Spoil = Callable[[Recording], Recording]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What widening the standard errors needs of an estimate."""
+
+    names: tuple[str, ...]
+    covariance: np.ndarray
+    parameters: dict[str, float]
 
 
 @cache
@@ -305,3 +315,14 @@ def test_a_joint_of_the_wrong_direction_is_a_cause(angle: int, torque: int, name
     left: Any = SimpleNamespace(residual_over_floor=np.array([60.0, 40.0]))
     said = cause_of_residual(load_config(CONFIGS / "fake_two_link.toml"), turned, left)
     assert said.startswith(named) and bool(said) is bool(named)
+
+
+@pytest.mark.parametrize(("brakes", "wider"), [((), 0.0), ((0.1, 0.2), 1e-3), ((0.1, None), 1e-3)])
+def test_the_lag_of_a_back_emf_widens_the_inertias_of_voltage_driven_joints(
+    brakes: tuple[float | None, ...], wider: float
+) -> None:
+    names = ("inertia_1", "coupling", "armature_2", "viscous_2")
+    estimate: Any = Estimate(names, np.diag([1e-8] * 4), {"viscous_1": 0.3, "viscous_2": 0.4})
+    found = np.diag(_with_late_back_emf(estimate, brakes).covariance) - 1e-8
+    second = 0.4 if None in brakes else 0.2
+    assert found == pytest.approx([(0.1 * wider) ** 2, 0.0, (second * wider) ** 2, 0.0], abs=1e-15)

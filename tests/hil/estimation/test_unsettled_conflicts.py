@@ -8,9 +8,16 @@ import pytest
 
 from hil.estimation.unsettled.estimate import Given, conflicts_in
 from hil.estimation.unsettled.plausibility import undetermined
-from hil.estimator.selection.segment_verdict import SegmentEvidence, judge_segments
+from hil.estimator.data.recording import Recording
+from hil.estimator.selection.segment_verdict import SegmentEvidence, judge_segments, relative_std
 
 NAMES = ("inertia_1", "gravity_1", "viscous_1", "coulomb_1", "offset_1")
+
+TIME = np.arange(0.0, 4.0, 0.01)
+RECORDING = Recording(
+    TIME, np.ones((2, TIME.size)), np.stack([2.0 * np.sin(7.0 * TIME)] * 2), np.full(2, 0.0015), "held"
+)
+"""Torques of 1 N m and speeds of 10 rad/s RMS."""
 
 
 def estimated(ratio: float = 1.0, zero: float = 0.0, left: float = 1.0) -> Any:
@@ -38,12 +45,22 @@ def estimated(ratio: float = 1.0, zero: float = 0.0, left: float = 1.0) -> Any:
     ],
 )
 def test_values_far_from_the_files_lower_the_verdict(estimate: Any, given: Given, trust: str, said: str) -> None:
-    recordings: Any = [SimpleNamespace(torque=np.ones((2, 10)))]
+    recordings = [RECORDING]
     held_out = np.array([0.001, 0.001])
     verdict = judge_segments(recordings, estimate, SegmentEvidence(held_out, conflicts=conflicts_in(estimate, given)))
     assert verdict.trust == trust
     assert said in " ".join(verdict.sentences)
     assert bool(said) == ("standard deviations from" in " ".join(verdict.sentences))
+
+
+def test_dry_friction_that_is_zero_and_known_to_be_so_is_no_weakness() -> None:
+    """Relative to itself, no error of it is small."""
+    estimate = estimated()
+    place = NAMES.index("coulomb_1")
+    estimate.value[place], estimate.std[place] = 1e-12, 1e-5
+    assert relative_std([RECORDING], estimate)["coulomb_1"] == pytest.approx(1e-4, rel=0.01)
+    estimate.std[place] = 0.5
+    assert relative_std([RECORDING], estimate)["coulomb_1"] > 1.0
 
 
 @pytest.mark.parametrize(
@@ -66,7 +83,7 @@ def test_the_verdict_names_the_limit_that_a_number_exceeds(
     left: float, error: float | None, std: float, undetermined: tuple[str, ...], trust: str, said: str
 ) -> None:
     """One rule for all recordings; a residual of 1.1 times the noise is not "cannot explain"."""
-    recordings: Any = [SimpleNamespace(torque=np.ones((2, 10)))]
+    recordings = [RECORDING]
     estimate = estimated(left=left)
     estimate.std[2] = std
     held_out = None if error is None else np.array([error])
@@ -79,7 +96,7 @@ def test_the_verdict_names_the_limit_that_a_number_exceeds(
 
 @pytest.mark.parametrize("spoiled", [True, False])
 def test_the_verdict_gives_its_own_reason_and_no_infinite_uncertainty(spoiled: bool) -> None:
-    recordings: Any = [SimpleNamespace(torque=np.ones((2, 10)))]
+    recordings = [RECORDING]
     estimate = estimated(left=9.0)
     estimate.std[3] = np.inf
     reason = "the fit leaves 13 % of the motion of joint 2 unexplained"
