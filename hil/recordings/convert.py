@@ -61,7 +61,8 @@ def convert(table: Table, columns: Columns) -> Converted:
         [_quantity(table, name, "position", whole.position_unit, ticks, notes) for name in whole.position]
     )
     if columns.position_unit is None:  # that of `whole` may be guessed
-        refuse_degrees(table.source, whole.position, time, position)
+        stated = [table.find(name)[2] is not None for name in whole.position]
+        refuse_degrees(table.source, whole.position, time, position, stated)
     found = rates(table, time, position)
     notes += velocity_notes(found)
     if whole.angles == "absolute":

@@ -14,7 +14,7 @@ _TIME = re.compile(
     r"(time|t|date_?time|timestamp|stamp|time_?stamp|seconds|secs|elapsed|clock)(_?s|_?sec|_?ms|_?us|_?ns)?", re.I
 )
 _KINDS = {
-    "position": re.compile(r"(?<![a-z])(q|pos|position|angle|theta|phi|state)(?![a-z])", re.I),
+    "position": re.compile(r"(?<![a-z])(q|qpos|pos|position|angle|theta|phi|state)(?![a-z])", re.I),
     "torque": re.compile(r"(?<![a-z])(tau|torque|effort|trq)(?![a-z])", re.I),
     "current": re.compile(r"(?<![a-z])(i|cur|curr|current|amp|amps)(?![a-z])", re.I),
     "voltage": re.compile(r"(?<![a-z])(u|volt|volts|voltage)(?![a-z])", re.I),
@@ -32,7 +32,7 @@ _NOT_MEASURED = re.compile(
     r"(?<![a-z])(des|desired|ref|reference|goal|target|sp|setpoint|cmd|commanded|sim|est)(?![a-z])", re.I
 )
 _NOT_POSITION = re.compile(
-    r"(?<![a-z])(vel|velocity|speed|acc|accel|dq|qd|qdd|ddq|temp|temperature|err|error)(?![a-z])", re.I
+    r"(?<![a-z])(vel|qvel|velocity|speed|acc|qacc|accel|dq|qd|qdd|ddq|temp|temperature|err|error)(?![a-z])", re.I
 )
 _LENGTHS = ("mm", "cm", "m", "in", "inch")
 _EXAMPLE = 5  # columns of a recording of two joints

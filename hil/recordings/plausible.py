@@ -16,6 +16,9 @@ from hil.estimator.arrays import Array
 MOST_RANGE_RAD = 4 * math.pi
 """Widest plausible range of a joint that moves back and forth [rad]."""
 
+TIMES_STATED = 3.0
+"""Factor by which a range may be wider if the column states its unit."""
+
 TIMES_NO_LOAD = 5.0
 """Highest plausible speed, relative to the no-load speed of the fastest servo."""
 
@@ -34,13 +37,16 @@ _OVER_S, _USUAL = 0.02, 0.9
 """Time over which speeds are averaged to suppress noise [s], and the quantile of the speeds that is checked."""
 
 
-def refuse_degrees(source: str, names: Sequence[str], time: Array, position: Array) -> None:
+def refuse_degrees(
+    source: str, names: Sequence[str], time: Array, position: Array, stated: Sequence[bool] | None = None
+) -> None:
     """Raise CsvError if `position` (joints, samples) [rad] is beyond the range of servos.
 
-    names: columns of the positions. time: sampling times (samples,) [s].
+    names: columns of the positions. time: sampling times (samples,) [s]. stated: whether a column states its unit, so
+    that several turns are believed; by default, none does.
     """
     fastest = TIMES_NO_LOAD * fastest_no_load()
-    for name, row in zip(names, position, strict=True):
+    for name, row, is_stated in zip(names, position, stated or (False,) * len(names), strict=True):
         known = np.isfinite(row) & np.isfinite(time)
         if not known.any():
             continue
@@ -49,7 +55,7 @@ def refuse_degrees(source: str, names: Sequence[str], time: Array, position: Arr
         rotates = high - low > _ONE_WAY * path
         if speed > fastest:
             what = f"its speed, {speed:.4g} rad/s, is more than {TIMES_NO_LOAD:g} times that of any servo"
-        elif high - low > MOST_RANGE_RAD and not rotates:
+        elif high - low > MOST_RANGE_RAD * (TIMES_STATED if is_stated else 1.0) and not rotates:
             what = f"it swings through {(high - low) / (2 * math.pi):.2g} turns"
         else:
             continue

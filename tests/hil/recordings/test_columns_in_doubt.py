@@ -191,3 +191,25 @@ def test_a_torque_or_current_without_a_unit_that_no_servo_has_is_refused(
     with pytest.raises(CsvError) as error:
         convert(read, columns)
     assert said in str(error.value)
+
+
+def test_velocities_of_a_simulator_s_log_are_not_suggested_as_torques() -> None:
+    log = table(qpos_0=rounded(1.0), qpos_1=rounded(0.5), qvel_0=TIME, qvel_1=TIME, ctrl_0=TIME, ctrl_1=TIME)
+    with pytest.raises(CsvError) as error:
+        guessed(log, Columns())
+    assert 'position = ["qpos_0", "qpos_1"]\ntorque = ["ctrl_0", "ctrl_1"]' in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("head", "swing", "accepted"), [("q [rad]", 8.0, True), ("q", 8.0, False), ("q [rad]", 200.0, False)]
+)
+def test_several_turns_are_believed_if_the_column_states_radians_but_no_impossible_speed(
+    head: str, swing: float, accepted: bool
+) -> None:
+    read = table(**{head: rounded(swing), "tau [N m]": np.sin(TIME)})
+    columns = Columns(time="t", position=[head], torque=["tau [N m]"])
+    if accepted:
+        assert convert(read, columns).recordings
+        return
+    with pytest.raises(CsvError, match="Is it in degrees"):
+        convert(read, columns)
