@@ -83,11 +83,18 @@ class Identification(SettledResult):
 
         Raises:
             ExportError: the format cannot hold this arm, or a package for it is not installed.
+            ResultError: the run folder holds another estimate by now.
         """
-        from hil.export.formats import export
+        from hil.export.formats import FORMATS, export
+        from hil.model_file import read_result
 
         if not isinstance(kind, str):
             raise TypeError(f'kind must be the name of one format, such as "urdf", not {kind!r}.')
+        if kind in FORMATS and dict(read_result(self.run).quantities) != dict(self.quantities):
+            raise ResultError(
+                f"{self.run} has been estimated again since this result was obtained, so the file would contain other "
+                f"values. To export the present ones: hil.load_run({str(self.run)!r}).result.export({kind!r})."
+            )
         return export(self.run, kind, None if out is None else Path(out), link_length)
 
 

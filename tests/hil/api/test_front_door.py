@@ -284,3 +284,15 @@ def test_check_says_that_the_pilot_takes_precedence_over_a_torque() -> None:
         found = [each for each in itertools.islice(check_arm(config), 3) if each.where == "experiment"]
         assert [each.found for each in found] == told * ["pilot = true takes precedence over peak_torque"]
         assert all("ignores peak_torque" in each.fix and each.level is Level.WARNING for each in found)
+
+
+def test_a_result_does_not_export_the_values_of_a_later_estimate(identified_once: Path, tmp_path: Path) -> None:
+    result = hil.load_run(identified_once).result
+    assert isinstance(result, hil.Identification)
+    other = {name: replace(each, value=2 * each.value) for name, each in result.parameters.items()}
+    former = replace(result, parameters=other)
+    assert result.export("toml", tmp_path / "arm.toml").path.is_file()
+    with pytest.raises(ResultError, match="has been estimated again since this result was obtained"):
+        former.export("toml", tmp_path / "other.toml")
+    assert former.export("csv", tmp_path / "samples.csv").path.is_file(), "the recording is the same"
+    assert not (tmp_path / "other.toml").exists()
