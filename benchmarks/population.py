@@ -1,4 +1,4 @@
-"""Randomly drawn arms, identified from the file of `hil init` to the verdict without any manual help.
+"""Identification of randomly drawn arms, from the file that `hil init` writes to the verdict, without manual help.
 
     python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--others] [--jobs N] [--json] [--keep DIR]
 

@@ -108,4 +108,4 @@ class TorqueHeld(WrongSetting):
 
 
 class TorqueNotOff(DriverError):
-    """Torque off could not be confirmed for every servo: cut the supply. Example: the cable was unplugged."""
+    """Torque off could not be confirmed for every servo: cut the power. Example: the cable was unplugged."""

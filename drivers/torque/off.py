@@ -153,11 +153,11 @@ class TorqueOff:
         if alone:
             return (
                 f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}: without a Bus "
-                "Watchdog, the last current may remain, so cut the supply now."
+                "Watchdog, the last current may remain, so cut the power now."
             )
         return (
             f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, "
-            "but cut the supply before you touch the arm."
+            "but still cut the power before you touch the arm."
         )
 
 

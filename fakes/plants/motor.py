@@ -167,7 +167,7 @@ class Motor:
     def _shape(
         self, step: float, torque: float, level: float, angle: float, velocity: float
     ) -> tuple[float, float, float]:
-        """Apply saturation, ripple, cogging, load-dependent friction, cable and stops, which only some drives have."""
+        """Apply what only some drives have: saturation, ripple, cogging, load-dependent friction, cables and stops."""
         drive = self._drive
         slope = 0.0
         if self._bent:

@@ -24,6 +24,7 @@ from hil.fakes.servo.backup import Backup, factory_reset
 from hil.fakes.servo.controller import (
     CURRENT_MODE,
     CURRENT_POSITION_MODE,
+    FULL_PWM,
     GOAL_OF_MODE,
     POSITION_MODE,
     POSITION_MODES,
@@ -209,7 +210,7 @@ class EmulatedServo(Powered):
                 self._derive()
         if not self._torque:
             return
-        if self._mode != CURRENT_MODE or self._voltage_limited:
+        if self._mode != CURRENT_MODE or self._is_limited:
             ticks = self.present.ticks(position)
             sign = self.present.position_sign if self._mode in POSITION_MODES else self.present.sign
             self.motor_current_a = sign * self.controller.motor_current(
@@ -427,7 +428,11 @@ class EmulatedServo(Powered):
         self._driven = self._torque and self._mode == CURRENT_MODE
         self._current_per_tick = self.present.sign * self.model.current_unit_a
         moves = self._torque and bool(self.model.operating_modes)
-        self.needs_ticks = self.health.changes or (moves and (self._mode != CURRENT_MODE or self._voltage_limited))
+        most = min(memory.get("PWM Limit", FULL_PWM), abs(memory.get("Goal PWM", FULL_PWM)))
+        self._is_limited = self._voltage_limited or (self._mode == CURRENT_MODE and most < FULL_PWM)
+        """Whether the supply, PWM Limit or Goal PWM may limit the current of current mode."""
+
+        self.needs_ticks = self.health.changes or (moves and (self._mode != CURRENT_MODE or self._is_limited))
         """Whether the servo's state changes with time alone, so that the bus must call `tick`."""
 
         if self._driven:
@@ -437,10 +442,11 @@ class EmulatedServo(Powered):
         self._current_limit: int = memory.get("Current Limit") if "Goal Current" in memory else -1
         by_goal = memory.get("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE
         accepts = bool(self.model.operating_modes) and not by_goal and watchdog != WATCHDOG_TRIPPED
-        self._goal_pwm_limit = memory.get("PWM Limit") if accepts and "Goal PWM" in memory else -1
+        takes_goal_pwm = accepts and self._mode != CURRENT_MODE and "Goal PWM" in memory
+        self._goal_pwm_limit = memory.get("PWM Limit") if takes_goal_pwm else -1
         """Largest Goal PWM that the fast path accepts [ticks]; -1 if every write takes the general path."""
         # The fast path bypasses the controller, in which the supply or, in one mode, the goal limits the current.
-        by_controller = self._voltage_limited or self._mode == CURRENT_POSITION_MODE
+        by_controller = self._is_limited or self._mode == CURRENT_POSITION_MODE
         self._takes_goal_current = accepts and not by_controller and self._current_limit >= 0
         if self.needs_ticks:
             self.controller.goals = Goals.read(self._mode, memory)

@@ -49,7 +49,7 @@ def calibrate(
     mass: Annotated[float, typer.Option("--mass", min=1e-6, metavar="KG", help="Mass bolted to the last link.")],
     distance: Annotated[
         float | None,
-        typer.Option("--distance", min=1e-6, metavar="M", help="Distance of the mass's centre from the last joint."),
+        typer.Option("--distance", min=1e-6, metavar="M", help="Distance from the last joint to the mass's centre."),
     ] = None,
     length: Annotated[
         float | None, typer.Option("--length", min=1e-6, metavar="M", help="Length of link 1; default: known.length_1.")

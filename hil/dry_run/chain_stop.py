@@ -151,7 +151,7 @@ def _dropped(space: Space, first: Array, before: Array, last: Array, rate: float
 
 
 def _helps(config: Config, at: int, longest: float, used: float, needed: float) -> str:
-    """Suggest a remedy for a joint that a stop does not lower to its rest angle.
+    """Suggest a remedy for a joint that is not lowered to its rest angle when the experiment is stopped.
 
     longest: duration of the longest path [s]. used: largest torque, relative to the limit. needed: largest torque that
     the simulated arms need to move slowly [N m].

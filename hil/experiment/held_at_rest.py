@@ -16,7 +16,7 @@ an arm of two joints, one swings the other.
 """
 
 AWAY_RAD = 0.1
-"""Deviation that is allowed in addition [rad]: gravity bends the spring, and friction may give way suddenly."""
+"""Additional allowance for the deviation [rad]: gravity deflects the spring, and a joint may break free suddenly."""
 
 
 class HeldAtRest:

@@ -83,6 +83,6 @@ class PilotOptions:
     band_raise: float = 3.0
     """Factor by which the lower end of experiment.band is raised if friction holds a joint during a full run."""
     max_low: float = 0.35
-    """Largest lower end of experiment.band that a repeated full run uses, as a fraction of its upper end."""
+    """Highest lower end of experiment.band that a repeated full run may use, as a fraction of the upper end."""
     max_settle_within: float = 0.1
     """Largest experiment.settle_within that a repeated full run accepts."""

@@ -128,7 +128,7 @@ class RecentMotion:
         return abs(last.velocity[joint]) * seconds > self._steps[joint]
 
     def is_unreachable(self, joint: int, velocity: float) -> bool:
-        """Whether no servo of this model turns that fast."""
+        """Whether this is faster than any servo of this model can turn."""
         return abs(velocity) > self._fastest[joint]
 
     def travels(self, joint: int) -> list[Travel]:

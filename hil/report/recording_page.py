@@ -32,8 +32,9 @@ class _Shown:
 
 
 def write_recording_report(folder: Path, out: Path | None = None) -> Path:
-    """Write the report of a recording folder, by default into it; return its path. Raises RunFolderError,
-    ResultError.
+    """Write the report on a recording folder, by default into that folder, and return the path of the report.
+
+    Raises RunFolderError, ResultError.
     """
     shown = _load(folder)
     title = Path(shown.record.config or shown.record.files[0].path).stem

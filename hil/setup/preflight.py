@@ -229,7 +229,7 @@ def _still_off(bus: ServoBus) -> Iterator[Finding]:
     if on:
         fix = (
             f"{on}: torque was off when this check began. Another program has switched it on and is driving the arm: "
-            "stop that program first, or cut the supply."
+            "stop that program first, or cut the power."
         )
         yield Finding(Level.STOP, "bus", "torque", "switched on during this check", fix)
 

@@ -1,4 +1,4 @@
-"""Mistakes in the columns of a spatial arm's recording: clear ones raise CsvError, others are left to the fit."""
+"""Mistakes in the columns of a spatial arm's recording: clear ones raise CsvError; the fit copes with the rest."""
 
 from collections.abc import Sequence
 

@@ -86,7 +86,7 @@ def test_a_servo_that_keeps_its_torque_though_it_answers_is_named(
     fake_config: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with ServoBus.open(fake_config()) as bus:
-        said = r"NOT CONFIRMED for JOINT 'ELBOW' \(ID 2.*reads back as 1.*cut the supply"
+        said = r"NOT CONFIRMED for JOINT 'ELBOW' \(ID 2.*reads back as 1.*cut the power"
         with pytest.raises(TorqueNotOff, match=said), bus.torque(watchdog=0.1):
             refusing(bus, 2, (TORQUE, 0), monkeypatch)
         assert not servos(bus)[1].torque_enabled

@@ -833,7 +833,7 @@ def test_a_servo_without_a_watchdog_that_falls_silent_is_said_to_go_on(
     config = arm(("[experiment]\n", "[safety]\nallow_no_watchdog = true\n\n[experiment]\n"))
     pull = once(lambda: setattr(ports[0].bus.servos[2], "connected", False))
     run = RunFolder.create(tmp_path / "run", config)
-    with pytest.raises(TorqueNotOff, match=r"NOTHING STOPS JOINT 'ELBOW' \(ID 2.*cut the supply now"):
+    with pytest.raises(TorqueNotOff, match=r"NOTHING STOPS JOINT 'ELBOW' \(ID 2.*cut the power now"):
         run_experiment(config, run, config.path, pull, plan)
     port = ports[0]
     port.clock.wait_until(port.clock.now() + 1.0)

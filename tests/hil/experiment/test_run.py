@@ -188,7 +188,7 @@ def test_a_pulled_cable_leaves_the_servos_to_their_watchdogs(
         for method in ("read", "write", "reset_input_buffer"):
             monkeypatch.setattr(FakeSerial, method, gone)
 
-    with pytest.raises(TorqueNotOff, match=r"NOT CONFIRMED for JOINT 'SHOULDER'.*'ELBOW'.*cut the supply") as caught:
+    with pytest.raises(TorqueNotOff, match=r"NOT CONFIRMED for JOINT 'SHOULDER'.*'ELBOW'.*cut the power") as caught:
         run(arm(), tmp_path / "run", at_sample(900, pull))
     assert isinstance(caught.value.__context__, PortLost)
     port = ports[0]
