@@ -341,3 +341,20 @@ def test_trajectory_turns_round_for_a_new_goal() -> None:
 def test_profile_without_velocity_is_a_step() -> None:
     assert profile(100.0, 0, 50, False) == (0.0, pytest.approx(50 * 2.4414e-4, rel=1e-3))
     assert profile(100.0, 0, 50, True) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("mode", [0, 5])
+@pytest.mark.parametrize("limit", ["PWM Limit", "Goal PWM"])
+@pytest.mark.parametrize("model", ["XM430-W350", "XL330-M288"])
+def test_pwm_limit_and_goal_pwm_limit_the_motor_in_current_modes_too(mode: int, limit: str, model: str) -> None:
+    """The manual: PWM Limit holds in every mode, and in modes other than PWM mode, Goal PWM is a limit as well."""
+    rig = Rig(mode, model, **({limit: 100} if limit == "PWM Limit" else {}))
+    free = Rig(mode, model)
+    for each in (rig, free):
+        each.write("Torque Enable", 1)
+        if limit == "Goal PWM" and each is rig:
+            each.write(limit, 100)
+        each.write(*(("Goal Current", 300) if mode == 0 else ("Goal Position", 4000)))
+        each.run(0.15)
+    assert abs(rig.read("Present PWM")) <= 107
+    assert abs(rig.shaft.velocity[0]) < 0.5 * abs(free.shaft.velocity[0])
