@@ -188,8 +188,8 @@ def _named(found: Estimated, read: Converted, config: RecordingConfig) -> Shooti
 
 
 def _brakes(columns: Columns) -> tuple[float | None, ...]:
-    """Return the viscous friction due to each joint's back-EMF [N m s/rad]; None if its torque constant is not known,
-    and nothing if the joints are not driven by voltage.
+    """Return the viscous friction due to each joint's back-EMF [N m s/rad]: None for each joint if the torque
+    constants are unknown, an empty tuple if the joints are not driven by voltage.
     """
     gains, constants = columns.gains, columns.torque_constant
     if columns.drive not in {"voltage", "pwm"} or gains is None:
