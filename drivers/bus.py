@@ -94,7 +94,7 @@ class ServoBus(TorqueSwitch):
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._last_answers: Sequence[Answer] = ()
         self._alerted: set[Joint] = set()
-        """Servos of joints with several that have set their alert bit in an exchange."""
+        """Servos that have set their alert bit in an exchange; recorded only if a joint has several servos."""
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":

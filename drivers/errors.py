@@ -26,7 +26,7 @@ class DriverError(Exception):
 
     last_samples: the last samples that an experiment recorded before the error, if one was running. in_doubt: the
     registers that may not have been restored, if all others are known to have been restored. after_torque: whether
-    the error was found after torque had been switched on; then it is not wrong input.
+    the error occurred after torque had been switched on, so that it does not count as wrong input.
     """
 
     last_samples: object = None

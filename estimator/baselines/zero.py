@@ -58,9 +58,9 @@ def turned_zeros(recordings: Sequence[Recording]) -> Array | None:
 
 
 def _half_turns(weights: Array, least: float) -> Array | None:
-    """Return zeros (joints,) [rad], 0 or half a turn, that make gravity torques positive; None if these already are.
+    """Return zeros (joints,) [rad], 0 or half a turn, that make gravity torques positive; None if they already are.
 
-    weights: torque of gravity in a horizontal pose, by joint (joints,) [N m]. Smaller ones than `least` have no sign.
+    weights: gravity torque of each joint in a horizontal pose (joints,) [N m]; below `least`, its sign is ignored.
     """
     angle, angles = 0.0, []
     for weight in weights.tolist():

@@ -74,8 +74,8 @@ BEYOND_SPEEDS = 3.0
 within the recorded range of speeds.
 """
 WIDEST_STEP = 0.3
-"""Width of the Coulomb friction step, as a multiple of a joint's highest speed, above which it could not be told from
-viscous friction.
+"""Width of the Coulomb friction step, as a multiple of a joint's highest speed, above which it could not be
+distinguished from viscous friction.
 """
 
 

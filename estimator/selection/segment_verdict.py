@@ -69,8 +69,8 @@ class SegmentEvidence:
 def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool = True) -> dict[str, float]:
     """Return the relative standard error of each base parameter except offsets and, without gravity, gravity torques.
 
-    A parameter may be zero, such as the dry friction of an ideal joint. If its torque is negligible, its error is
-    relative to the fraction LITTLE_TORQUE of the RMS torque.
+    A parameter may be zero, such as the dry friction of an ideal joint. If the torque due to a parameter is negligible,
+    its error is relative to the fraction LITTLE_TORQUE of the RMS torque.
     """
     torque = LITTLE_TORQUE * np.sqrt(np.mean([np.mean(each.torque**2, axis=1) for each in recordings], axis=0))
     speed = np.sqrt(np.mean([np.mean(_velocity(each) ** 2, axis=1) for each in recordings], axis=0))
@@ -150,8 +150,8 @@ def _is_refused(left: float, held_out: Array | None, evidence: SegmentEvidence) 
 def _largest_error(left: float) -> float:
     """Return the largest usable prediction error, relative to the motion's RMS. left: residual over noise.
 
-    If the residual is hardly more than the noise, half of a recording with little motion merely determines the
-    parameters less well than all of it.
+    If the residual hardly exceeds the noise, a larger error is acceptable: half of a recording with little motion
+    merely determines the parameters less well than the whole recording.
     """
     return EXPLAINED_PREDICTION if left <= NEARLY_EXPLAINED else USABLE_PREDICTION
 
@@ -177,7 +177,7 @@ def _left(estimate: ShootingEstimate, evidence: SegmentEvidence) -> str:
     if left[joint] <= MUCH_LEFT and evidence.held_out is not None:
         said += f" (up to {MUCH_LEFT:g} times is acceptable if other motion is predicted well)"
     said += "."
-    # A linear estimate of more than the whole residual means that the term is not small: its effect is unknown.
+    # If the linearised effect exceeds the whole residual, the term is not small, and its effect is unknown.
     seen = [each for each in evidence.candidates if each.evidence > 1.0 and NOTICEABLE < each.explained <= 1.0]
     if seen:
         part = seen[0].part.replace("_", " ")

@@ -348,7 +348,7 @@ class Selection:
     def judged(self, chosen: Trial) -> Trial:
         """Return `chosen`, unless it has no standard errors or another trial predicts the held-out motion much better.
 
-        An estimate has none if the motion is too sensitive to one of its terms, such as extremely stiff bristles.
+        An estimate has no standard errors if the motion is too sensitive to a term, such as extremely stiff bristles.
         """
         certain = [trial for trial in self.trials if trial.has_standard_errors]
         if not certain:

@@ -205,8 +205,8 @@ class _Search:
         return SegmentChoice(tuple(self._trials.values()), chosen, best, plain)
 
     def _with_standard_errors(self, best: ShootingEstimate, plain: ShootingEstimate) -> ShootingEstimate:
-        """Return `best`, or a simpler estimate if no parameter of `best` has a standard error, as with extremely stiff
-        bristles.
+        """Return `best`, or a simpler estimate if no parameter of `best` has a standard error, as can happen with
+        extremely stiff bristles.
         """
         for model in (best.model, best.model.without("presliding"), plain.model):
             found = best if model == best.model else self.fit(model, plain)

@@ -25,7 +25,7 @@ GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # prediction error relative to 
 LEAST_PERCENT = 0.01  # smallest prediction error that is reported; smaller ones are lost in the noise
 MUCH_LEFT = 5.0  # ratio of residual to noise above which parameters are doubtful without a held-out check
 WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
-UNDETERMINED = 10.0  # standard error over value above which a parameter is not determined at all
+UNDETERMINED = 10.0  # ratio of standard error to value above which a parameter is not determined at all
 LITTLE_EFFECT = 0.02  # standard error of a parameter's torque, relative to the joint's, below which it hardly matters
 ALIKE = 0.99  # correlation above which two parameters are hard to separate
 NOTICEABLE = 0.005  # fraction of the residual that a term must explain to be mentioned
@@ -89,7 +89,7 @@ class Evidence:
     cause: str = ""
     """A likely cause of any residual, known from how the motion was driven, as a sentence."""
     ended_early: bool = False
-    """Whether there is no held-out motion because the recording ends before it settled."""
+    """Whether there is no held-out motion because the recording ends before that motion settled."""
 
 
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:
@@ -300,7 +300,7 @@ def _warm_up(seconds: float) -> int:
 def _predicted(evidence: Evidence) -> tuple[str, ...]:
     held_out, as_fitted = evidence.held_out, evidence.held_out_as_fitted
     if held_out is None and evidence.ended_early:
-        return ("The model was not validated on a held-out motion, because the recording ends before that.",)
+        return ("The model was not validated on a held-out motion, because the recording ends too early.",)
     if held_out is None:
         return ("The model was not validated on a held-out motion: set experiment.held_out = true.",)
     worst = _percent(held_out)

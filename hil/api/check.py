@@ -13,7 +13,7 @@ from hil.results.display import html_table
 from hil.setup.preflight import Finding, Level, check_arm
 
 _ALWAYS_HELD_HZ = 150.0
-"""Rate [Hz] from which on the delay of a stabiliser is not checked, because loading the pilot takes a second."""
+"""Rate [Hz] from which the delay of a stabiliser is no longer checked, because loading the pilot takes a second."""
 
 __all__ = ["CheckReport", "Finding", "Level", "check"]
 

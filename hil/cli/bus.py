@@ -142,7 +142,7 @@ def setup(
 ) -> None:
     """Set a servo's ID, baud rate, return delay or Secondary ID. Asks before each write and reads each value back.
 
-    First restores all servos of this port that a killed run left with torque on or with its settings.
+    First restores all servos on this port that a killed run left with torque on or with that run's settings.
     """
     from hil.cli.views.question import agrees
     from hil.cli.views.setup_view import changed, print_changes

@@ -99,7 +99,7 @@ def _bounded(stream: Any, patience: "_Patience") -> Any:
 class _Patience:
     """How long output waits for its reader: indefinitely until a signal arrives, `PATIENCE_S` from then on.
 
-    heard: non-blocking file descriptor from which the number of each signal that arrives can be read as a byte.
+    heard: non-blocking file descriptor that delivers the number of each arriving signal as one byte.
     """
 
     def __init__(self, heard: int) -> None:
@@ -126,8 +126,8 @@ class _Patience:
     def listening(self) -> Iterator[None]:
         """While output waits, let a signal that nothing else handles end the wait instead of the program.
 
-        This applies even if the signal was ignored when the program started, as shells do with Ctrl-C for background
-        jobs: nothing but the output is lost. A SIGHUP that is ignored (nohup) remains so.
+        This applies even to a signal that was ignored when the program started, such as Ctrl-C in a shell's background
+        jobs, since only output is lost. An ignored SIGHUP (nohup) remains ignored.
         """
         if threading.current_thread() is not threading.main_thread():
             yield
@@ -168,7 +168,7 @@ class _Bounded(io.RawIOBase):
         return True
 
     def write(self, data: Any) -> int:
-        if self._patience.has_discarded:  # more of it would leave a gap
+        if self._patience.has_discarded:  # writing more would leave a gap
             return len(data)
         if not self._is_ready(0.0):
             with self._patience.listening():
@@ -181,7 +181,7 @@ class _Bounded(io.RawIOBase):
         return written
 
     def _is_ready(self, seconds: float) -> bool:
-        """Whether a piece can be written without blocking; waits at most this time [s]."""
+        """Wait at most this time [s] until a piece can be written without blocking; return whether it can."""
         return bool(select.select([], [self._number], [], seconds)[1])
 
 

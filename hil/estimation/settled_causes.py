@@ -1,4 +1,4 @@
-"""Causes of a settled motion that the model does not explain, which the configuration or the motion itself reveals."""
+"""Why the model does not explain a settled motion, if the configuration or the motion itself reveals the cause."""
 
 from contextlib import suppress
 
@@ -16,7 +16,7 @@ from hil.estimator.selection.verdict import MUCH_LEFT
 
 
 def cause_of_residual(config: Config, period: SettledPeriod, validation: Validation) -> str:
-    """Return sentences about a rate that beats with the servos, a wrong direction or a stop; "" if there are none."""
+    """Return sentences about a rate that beats with the servos, a wrong direction or a stop; "" if none applies."""
     said = [varying_delay(config)]
     if float(validation.residual_over_floor.max()) > MUCH_LEFT:
         with suppress(RecordingError):  # a joint that hardly moved
@@ -28,8 +28,8 @@ def cause_of_residual(config: Config, period: SettledPeriod, validation: Validat
 def _reversed(config: Config, recording: Recording) -> str:
     """Return a sentence about a joint with a wrong sign; "" if there is none.
 
-    If the directions of both joints were wrong, the arm would be the mirror image of another one, and nothing would
-    contradict it. Therefore only their relative direction shows, not which of the two is wrong.
+    If the directions of both joints were wrong, the motion would be that of a mirror-image arm, and nothing would
+    contradict it. The motion therefore reveals only that the two directions are inconsistent, not which one is wrong.
     """
     names = [joint.name for joint in config.joints]
     found = suspect_signs([recording])
@@ -39,9 +39,9 @@ def _reversed(config: Config, recording: Recording) -> str:
     if found.signs.torque == found.signs.position == (1, -1):
         first, second = names
         return (
-            f"The direction of {first} or that of {second} is probably wrong: with angle and torque of {second} "
-            f"reversed, {effect}. With torque off, turn both joints by hand in the same sense: if one angle grows "
-            "and the other falls, correct direction (and zero_ticks) of the joint whose angle goes the wrong way."
+            f"The direction of {first} or {second} is probably wrong: with the angle and torque of {second} reversed, "
+            f"{effect}. With torque off, turn both joints by hand in the same direction. If one angle increases and "
+            "the other decreases, correct direction (and zero_ticks) of the joint whose angle changes the wrong way."
         )
     said = reversal_said(found.signs, names)
     return f"{said[0].upper()}{said[1:]}, {effect}. Check the wiring of the motors, direction and torque_constant."

@@ -276,7 +276,7 @@ class Guard:
                 )
 
     def look_while_held(self, state: State) -> None:
-        """Raise SafetyStop when a joint leaves its rest pose although only the stabiliser drives it."""
+        """Raise SafetyStop if a joint leaves its rest pose although only the stabiliser drives the arm."""
         if self._held is None:
             if not any(state.missing):
                 self._held = HeldAtRest(self._config, self._resting or state.position)

@@ -69,7 +69,7 @@ _LAG_S = 0.012
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 JOLT_S, JOLT_BACK_S = 0.01, 0.08
-"""Times within which a slipping joint's velocity changes, and changes back [s]; at rates below some 40 Hz, the latter
+"""Times within which a slipping joint's velocity changes, and changes back [s]; at rates below about 40 Hz, the latter
 is three sample intervals.
 """
 
@@ -79,14 +79,14 @@ changes.
 """
 
 IMPACT_TIMES, IMPACT_S = 1.5, 10.0
-"""Smallest ratio of a jolt to the largest earlier change of velocity that was not followed by one back, and the time
-constant with which that is forgotten [s].
+"""Smallest ratio of a jolt to the largest earlier change of velocity that was not followed by a change back, and
+the time constant with which that earlier change is forgotten [s].
 """
 
 PLAY_RAD, CURVED = 0.03, 0.2
-"""Displacement within a jolt that a gear may cause [rad], a few times the backlash in a servo's data sheet, because an
-elastic gear bounces from one flank to the other; and allowance for the curvature of ordinary motion,
-as a fraction of the usual change of velocity times the duration.
+"""Displacement that a gear may cause within a jolt [rad], a few times the backlash in a servo's data sheet, because an
+elastic gear bounces from one flank to the other; and allowance for the curvature of ordinary motion, as a fraction of
+the usual change of velocity times the duration.
 """
 
 _USUAL_S = 1.0
@@ -104,9 +104,9 @@ JOLT = np.dtype(
 
 square: mean square of ordinary changes [rad^2/s^2], over age [s]. squared, since: integral of the squared changes that
 are not yet included because they may belong to a jolt, and the time that it covers [s]. change: first change of a
-possible jolt [rad/s]. begun: time of that change [s]. impact: the largest change of velocity so far that was not part
-of a jolt, fading [rad/s]. count, oldest: number of earlier velocities stored, and the row
-of the oldest. reversed: whether the joint reversed in the first change of a possible jolt.
+possible jolt [rad/s]. begun: time of that change [s]. impact: largest change of velocity so far that was not part of a
+jolt, decaying with time [rad/s]. count, oldest: number of earlier velocities stored, and the row of the oldest.
+reversed: whether the joint reversed in the first change of a possible jolt.
 """
 
 
@@ -118,9 +118,9 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
     therefore needs no knowledge of the arm. Changes of velocity over `JOLT_S` are compared with ordinary ones.
 
     If the joint reverses in both changes, the motor has crossed the backlash of its gear twice in succession, which it
-    does much faster than it can move the arm. This is not a jolt. In a gear with much play, a tooth that meets the
-    other flank changes the velocity without a reversal, too. By chance, two such impacts may look like a jolt. Single
-    ones are much more frequent, so a jolt must exceed the largest of them.
+    does much faster than it can move the arm. This is not a jolt. In a gear with much backlash, a tooth that strikes
+    the opposite flank changes the velocity even without a reversal. Two such impacts may by chance look like a jolt.
+    Single impacts are much more frequent, so a jolt must exceed the largest of them.
 
     joints: records of type JOLT. former: the latest velocities (samples within `JOLT_S`, joints) [rad/s]. least:
     smallest change that counts as a jolt [rad/s]. longest: time within which the velocity jumps back [s].
@@ -229,7 +229,7 @@ def _watch_loop(
 
 
 def jolt_back_s(interval: float) -> float:
-    """Return the time within which a slipping joint's velocity changes back [s]. interval: between samples [s]."""
+    """Return the time within which a slipping joint's velocity changes back [s]. interval: time between samples [s]."""
     return max(JOLT_BACK_S, 3.0 * interval)
 
 

@@ -258,7 +258,7 @@ def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> 
 def _check_unchanged(bus: ServoBus) -> Settings:
     """Check that the servos' settings have not changed since the session began; return them.
 
-    Raises BusShared if another program has changed any.
+    Raises BusShared if another program has changed any of them.
     """
     before = {each: value for each, value in settings_at_start().items() if each[1] not in WRITTEN}
     now = settings_now(bus)
@@ -340,8 +340,8 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if wire > 1 / rate:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms of wire time alone at "
-            f"{bus.port.baud} baud, so it must be below {floor(1 / wire)} Hz, and the adapter needs time, too. "
-            "Set it to what `hil check` measures, or raise the baud rate with `hil setup`."
+            f"{bus.port.baud} baud, so the rate must be below {floor(1 / wire)} Hz, and the adapter needs time, too. "
+            "Set the rate to what `hil check` measures, or raise the baud rate with `hil setup`."
         )
     slowest = bus.port.latency + wire
     if slowest <= 1 / rate:

@@ -329,7 +329,7 @@ class Stream:
                 raise DidNotMove(
                     f"{joint.title} moved by only {way:.4f} rad in a whole period: it is stuck, friction holds it, or "
                     f"{without_torque(joint)}.{against} Move it by hand with torque off; if it is free, check its "
-                    f"wires and its gear, or {self._more_torque()}."
+                    f"wiring and its gear, or {self._more_torque()}."
                 )
 
     def _more_torque(self) -> str:

@@ -5,8 +5,8 @@ makes a joint exceed a limit. Therefore the guard is given narrow limits for suc
 constant ratio from run to run, up to the current limit. As soon as the joint moves and so reveals its friction, the arm
 is braked and the run ends.
 
-A joint that gravity presses against a stop stands still as well, until its torque lifts it. The next runs would let it
-bounce on the stop, which a planar arm's model does not contain.
+A joint that gravity presses against a stop also stands still until its torque lifts it. In the following runs, it would
+bounce on the stop, which the model of a planar arm does not include.
 """
 
 import math
@@ -24,10 +24,10 @@ from hil.pilot.options import PilotOptions
 from hil.pilot.seen import Seen
 
 _LEANS = 0.1
-"""Cosine of a link's angle at rest from which gravity may press it against something."""
+"""Smallest cosine of a link's angle at rest at which gravity may press the link against something."""
 
 _AT_REST_RAD = 0.03
-"""Largest distance of a stop from the pose before the run [rad]."""
+"""Largest distance between a stop and the pose before the run [rad]."""
 
 _UNEXPLAINED = 0.25
 """Smallest fraction of the torque that inverse dynamics must leave unexplained without a stop."""
@@ -69,7 +69,7 @@ def broke_free(config: Config, narrow: Config, seen: Array) -> Mask:
 
 
 def resting_on_stop(config: Config, seen: Seen) -> str:
-    """Explain that a planar arm's joint rests on something which it leaves in one direction only; "" if it does not."""
+    """Return sentences if a joint of a planar arm rests on something and can move in one direction only; else ""."""
     leans = any(abs(math.cos(angle)) > _LEANS for angle in np.cumsum(config.arm.rest_pose))
     if config.arm.gravity == 0.0 or not leans:
         return ""
@@ -81,10 +81,10 @@ def resting_on_stop(config: Config, seen: Seen) -> str:
     if stop is None or stop.residual_given < _UNEXPLAINED or abs(stop.at - seen.pose[stop.joint - 1]) > _AT_REST_RAD:
         return ""
     return (
-        f"{config.joints[stop.joint - 1].joint.title} rests on something that yields (a stop, a table or a cable) at "
-        f"{stop.at:.2f} rad: with a stiffness of {float(f'{stop.stiffness:.2g}'):g} N m/rad there, inverse dynamics "
+        f"{config.joints[stop.joint - 1].joint.title} rests against something compliant (a stop, a table or a cable) "
+        f"at {stop.at:.2f} rad: with a stiffness of {float(f'{stop.stiffness:.2g}'):g} N m/rad there, inverse dynamics "
         f"leaves {100 * stop.residual:.2g} % of the torque unexplained instead of {100 * stop.residual_given:.2g} %. "
-        "Every further run would press and bounce against it, and a planar arm's model contains no stop. Change the "
-        "mounting, or what the arm rests on, so that it hangs freely, then correct arm.rest_pose; or describe the arm "
-        "by a URDF, whose joints may rest against their stops."
+        "In every further run, the arm would press and bounce against it, and the model of a planar arm includes no "
+        "stops. Change the mounting, or what the arm rests on, so that the arm hangs freely, then correct "
+        "arm.rest_pose; or describe the arm with a URDF, in which joints may rest against their stops."
     )

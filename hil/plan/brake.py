@@ -37,8 +37,8 @@ Some increase is normal: gravity and the other joint's brake act on the joint.
 """
 
 STILL_FASTER, SLOWS_AFTER_S = 0.06, 0.02
-"""The same once braking has lasted for this time [s]: a joint with a high velocity limit could otherwise be driven by a
-reversed motor until braking ends.
+"""The corresponding fraction once braking has lasted for the given time [s]. Otherwise, a reversed motor could drive a
+joint with a high velocity limit until braking ends.
 """
 
 NOTICED_AFTER = 2

@@ -67,7 +67,7 @@ class RecentMotion:
             self._states.append(state)
 
     def previous(self, joint: int) -> State | None:
-        """Return the latest exchange before the newest one that the joint answered; None if there is none."""
+        """Return the latest exchange that the joint answered, not counting the newest one; None if there is none."""
         earlier = (state for state in reversed(self._states) if state is not self._states[-1])
         return next((state for state in earlier if not isnan(state.position[joint])), None)
 

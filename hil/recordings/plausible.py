@@ -1,4 +1,4 @@
-"""Rejection of angles, torques, currents and voltages that no servo arm reaches: most often, their unit is not stated.
+"""Rejection of angles, torques, currents and voltages that no servo arm reaches, usually because no unit is stated.
 
 Joints that rotate continuously are accepted, and so is everything if [columns] states the unit. A torque, current or
 voltage is also accepted if its column states the unit.
@@ -17,14 +17,14 @@ MOST_RANGE_RAD = 4 * math.pi
 """Widest plausible range of a joint that moves back and forth [rad]."""
 
 TIMES_STATED = 3.0
-"""Factor by which a range may be wider if the column states its unit."""
+"""Factor by which the range may be wider if the column states its unit."""
 
 TIMES_NO_LOAD = 5.0
 """Highest plausible speed, relative to the no-load speed of the fastest servo."""
 
 MOST_DRIVE = {"torque": (60.0, "N m", "mN m"), "current": (40.0, "A", "mA"), "voltage": (60.0, "V", "mV")}
-"""Largest plausible value of each kind of drive command, its SI unit, and the unit that is usual for larger numbers.
-The largest servos (PH54) deliver 45 N m continuously and are supplied with 24 V.
+"""Largest plausible value of each kind of drive command, its SI unit, and the usual unit of larger numbers. The
+largest servos (PH54) deliver 45 N m continuously and run on 24 V.
 """
 
 _ONE_WAY = 0.7
@@ -42,8 +42,8 @@ def refuse_degrees(
 ) -> None:
     """Raise CsvError if `position` (joints, samples) [rad] is beyond the range of servos.
 
-    names: columns of the positions. time: sampling times (samples,) [s]. stated: whether a column states its unit, so
-    that several turns are believed; by default, none does.
+    names: columns of the positions. time: sampling times (samples,) [s]. stated: whether each column states its
+    unit, in which case several turns are accepted; by default, none does.
     """
     fastest = TIMES_NO_LOAD * fastest_no_load()
     for name, row, is_stated in zip(names, position, stated or (False,) * len(names), strict=True):
@@ -72,7 +72,7 @@ def refuse_degrees(
 def refuse_thousandths(source: str, name: str, kind: str, values: Array) -> None:
     """Raise CsvError if `values` (samples,) of a column without a unit are too large for the SI unit.
 
-    kind: a key of `MOST_DRIVE`; others are accepted.
+    kind: a key of `MOST_DRIVE`; values of other kinds are accepted.
     """
     if kind not in MOST_DRIVE:
         return
@@ -80,8 +80,8 @@ def refuse_thousandths(source: str, name: str, kind: str, values: Array) -> None
     most = float(np.nanmax(np.abs(values), initial=0.0))
     if most > limit:
         raise CsvError(
-            f"{source}: column {name!r} states no unit and reaches {most:.4g}, which would be {most:.4g} {unit}: more "
-            f"than any servo. Is it in {other}? Then append [{other}] to the column's name, or set "
+            f"{source}: column {name!r} states no unit and reaches {most:.4g}, which would be {most:.4g} {unit}: too "
+            f"much for any servo. Is it in {other}? Then append [{other}] to the column's name, or set "
             f'{kind}_unit = "{other}" in [columns] of --config ARM.toml (in Python: config="ARM.toml"). If it is in '
             f'{unit}, set {kind}_unit = "{unit}" there.'
         )

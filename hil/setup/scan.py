@@ -167,7 +167,7 @@ def _describe(port: Port, servo_id: int, data: bytes) -> Found:
 
 
 def _looked_at(port: Port, heard: Heard) -> Heard:
-    """Add to each servo's trouble whether its torque is on and its watchdog has tripped. Raises PortLost."""
+    """Add to each servo's trouble whether its torque is on and whether its watchdog has tripped. Raises PortLost."""
     return heard._replace(servos=tuple(_with_state(port, found) for found in heard.servos))
 
 

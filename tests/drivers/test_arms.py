@@ -97,7 +97,7 @@ def test_an_alert_of_a_pair_is_the_servo_s_that_raised_it_even_without_a_hardwar
         port.bus.faults.add(Fault(kind=FaultKind.STATUS_ERROR, at=port.bus.time, servo=servo, amount=128.0))
         state = bus.exchange([0.0, 0.0])
         port.bus.faults.clear()
-        bus.exchange([0.0, 0.0])  # as while an arm is lowered
+        bus.exchange([0.0, 0.0])  # as happens while an arm is lowered
         with pytest.raises(ServoFault, match=rf"^Joint 'shoulder' \(ID {servo}, .*no hardware error now") as fault:
             bus.check_alerts(state)
         assert str(fault.value).count("raised its alert") == 1

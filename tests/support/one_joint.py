@@ -1,4 +1,4 @@
-"""One joint in the guard's compiled checks, all of which but one are given nothing to find; and its readings."""
+"""One joint in the guard's compiled checks, only one of which is given something to find, and its readings."""
 
 import math
 from collections.abc import Callable, Sequence

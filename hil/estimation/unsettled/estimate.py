@@ -44,7 +44,7 @@ JUMPED = (
     "A position jumped (see the warnings), so angles before and after the jump are inconsistent: use only the part "
     "before or after it, or put each part in a separate file."
 )
-LAG_S = 1e-3  # lag of a motor's current behind its voltage; that of small motors is 0.1 to 2 ms
+LAG_S = 1e-3  # lag of a motor's current behind its voltage; 0.1 to 2 ms for small motors
 NOT_HERE = ("ripple", "cogging", "encoder")
 
 
@@ -79,7 +79,7 @@ class Given:
     repeats: bool = False
     length: float | None = None
     brakes: tuple[float | None, ...] = ()
-    """Viscous friction of each voltage-driven joint that is due to back-EMF [N m s/rad]; None if it is not known."""
+    """Part of each voltage-driven joint's viscous friction that is due to back-EMF [N m s/rad]; None if unknown."""
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
@@ -156,10 +156,10 @@ def estimate_any(
 
 
 def _with_late_back_emf(estimate: ShootingEstimate, brakes: Sequence[float | None]) -> ShootingEstimate:
-    """Widen the standard errors of the inertias that the lag of voltage-driven motors' currents lowers.
+    """Widen the standard errors of inertias that appear too small because a voltage-driven motor's current lags.
 
-    The back-EMF of such a motor brakes its joint a little late, so the inertia appears smaller by brake times lag. A
-    recording does not state the lag, and hardly shows it.
+    The back-EMF of such a motor brakes its joint slightly late, so the inertia appears smaller by the viscous friction
+    due to back-EMF times the lag. A recording does not state the lag and hardly reveals it.
     """
     covariance = estimate.covariance.copy()
     for joint, brake in enumerate(brakes, 1):

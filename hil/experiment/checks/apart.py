@@ -26,10 +26,10 @@ def opposed(joint: Joint) -> str:
 
 
 def without_torque(joint: Joint) -> str:
-    """Say why a joint may get no torque although nothing is reported.
+    """Say why a joint may receive no torque although no fault is reported.
 
-    A broken wire or winding shows in the motor current, which the guard compares with its goal, but not in the applied
-    voltage or in the supply current.
+    A broken wire or winding is visible in the motor current, which the guard compares with its goal, but not in the
+    applied voltage or the supply current.
     """
     if joint.mode is Mode.CURRENT and not joint.servo.senses_supply:
         return "its gear does not transmit the motor's torque"

@@ -163,10 +163,10 @@ position, velocity, turn: latest values, and latest change of velocity [rad, rad
 first one and after a long gap. unsure: uncertainty of the time of the latest measurement [s]. seconds, moved,
 difference, unknown: sums since the long memory was last updated; most_curved: the maximum since then. seen:
 `difference`, except for motion that is too slow for the velocity register; behind: position minus that of a
-reference that follows such motion [rad]. headed: time of motion in the positive
-direction minus time of motion in the negative direction, since the same update [s]. rough: sum of squares of the errors
-that velocity jumps may have caused since then [rad^2]. heading, roughness, moving: what the slow memory holds of
-`headed`, `rough` and the time in motion [s]. learnt: information from which lag and scale error were estimated
+reference that follows such motion [rad]. headed: time of motion in the positive direction minus time of motion in the
+negative direction, since the same update [s]. rough: sum of squares of the errors that velocity jumps may have caused
+since then [rad^2]. heading, roughness, moving: what the slow memory holds of `headed`, `rough` and the time in motion
+[s]. learnt: information from which lag and scale error were estimated
 [rad^2/s]. lag, scale: their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the
 sums from which lag and scale error are estimated.
 """
@@ -322,9 +322,9 @@ def _creeps(memory: Any, velocity: float, unsure: float) -> bool:
 def _moved_at_rest(memory: Any, moved: float, seconds: float) -> float:
     """Process an interval in which the velocity reads zero; return the motion that contradicts this [rad].
 
-    A reference follows the position at up to one step of the velocity, and never lags behind by more than `STEP_RAD`.
-    What it has to jump for this is returned. In contrast to a sum of large changes of position, encoder noise, which
-    returns to its mean, does not accumulate in it.
+    A reference follows the position at a speed of up to one step of the velocity. Where this is too slow, the reference
+    jumps, so that it is never more than `STEP_RAD` away from the position. The jump is returned. Encoder noise returns
+    to its mean, so it would accumulate in a sum of large position changes, but does not accumulate in these jumps.
     """
     slow = RESOLUTION_RAD_S * seconds
     behind = memory.behind + moved

@@ -81,7 +81,7 @@ class JointFaults:
         return None
 
     def swapped(self, index: int, state: State) -> str:
-        """Explain a joint's change of angle by replies swapped with another servo's; "" if they are not."""
+        """Return a sentence if a joint's angle changed because replies of two servos were swapped; otherwise ""."""
         before = [self._recent.previous(joint) for joint in range(len(self._records))]
         pair = self._swapped.look(index, state, before)
         return "" if pair is None else swapped_advice(*pair)
@@ -145,7 +145,7 @@ class JointFaults:
                 Cause.GOALS_CHANGED,
                 f"{said} at {velocity:.2f} rad/s: {self.supply[index]:.1f} V would drive the commanded current at "
                 "that speed, according to the published figures. Its goals are being altered in transit or by another "
-                "program, its supply sags, a wire or contact of its motor is loose, or its current sensor is wrong: "
+                "program, its supply sags, a motor wire or contact is loose, or its current sensor is wrong: "
                 "check these. If all are in order, its motor is weaker than published: lower velocity_limit to "
                 f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s.",
             )
@@ -171,7 +171,7 @@ class JointFaults:
         return (
             Cause.OUT_OF_VOLTAGE,
             f"carries {carried:.3f} {unit} instead of the commanded {goal:.3f} {unit} at {velocity:.2f} rad/s: at that "
-            "speed its supply cannot drive more current against the back-EMF, a wire or contact of its motor is loose, "
+            "speed its supply cannot drive more current against the back-EMF, a motor wire or contact is loose, "
             "or its current sensor is wrong. Check the motor's wiring first. If it is sound, lower velocity_limit to "
             f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s, or raise the supply voltage; if this happens at lower speeds "
             f"too, suspect the wiring or the sensor.{self._lower_torque}",
@@ -201,7 +201,7 @@ class JointFaults:
                 f"Its goals are being altered in transit or by another program, its current sensor is wrong, or {weak}"
             )
         # The applied voltage, which is measured in PWM mode, does not depend on the motor's wires.
-        wire = "" if self._models[index] is None else "a wire of its motor is broken, "
+        wire = "" if self._models[index] is None else "a motor wire is broken, "
         return f"Its torque is off, it was rebooted, its watchdog tripped, {wire}its current sensor is wrong, or {weak}"
 
     def _disagree(self, index: int, state: State) -> Fault:

@@ -1,7 +1,7 @@
-"""Detect swapped replies: two servos that have jumped, each to where the other one was.
+"""Detect swapped replies: two servos, each of which has jumped to the other's former position.
 
-If two servos have exchanged their IDs, or if their replies are mixed up on the way, the angles of both jump although no
-encoder is wrong. The servos' raw positions [ticks] are compared, since each has its own zero and direction.
+If two servos have swapped IDs, or if their replies are mixed up in transit, both angles jump although no encoder is
+wrong. The servos' raw positions [ticks] are compared, since each servo has its own zero and direction.
 """
 
 import math
@@ -14,17 +14,17 @@ from hil.drivers.state import State
 __all__ = ["SwappedReplies", "swapped_advice"]
 
 _NEAR = 0.25
-"""How close to the other servo's former position each servo must land, relative to their distance from each other."""
+"""How close each servo must land to the other's former position, relative to the distance between these positions."""
 
 _LEAST_TICKS = 6
-"""Smallest distance between two servos [ticks] at which a swap can be told from the noise of their encoders."""
+"""Smallest distance between two positions [ticks] at which a swap can be distinguished from encoder noise."""
 
 
 def swapped_advice(first: int, second: int) -> str:
     """Return the explanation for two servos, given by their IDs, that report each other's position."""
     return (
-        f"The replies of IDs {first} and {second} seem to be swapped, since each of the two now reports the position "
-        "that the other one had: the servos' IDs have been exchanged, or an adapter or another program mixes up the "
+        f"The replies of IDs {first} and {second} seem to be swapped, since each of these servos now reports the "
+        "other's former position: the servos have swapped IDs, or an adapter or another program is mixing up the "
         "replies. List the servos with `hil scan`, and check what is connected between the adapter and the servos."
     )
 
@@ -44,8 +44,8 @@ class SwappedReplies:
         self._drives = [joint.drives for joint in joints]
 
     def look(self, joint: int, now: State, before: Sequence[State | None]) -> tuple[int, int] | None:
-        """Return the IDs of two servos, the first one a servo of this joint, that have exchanged their positions; None
-        if there are none.
+        """Return the IDs of two servos that have exchanged positions, the first of which belongs to this joint; None if
+        there are none.
 
         now: the latest exchange. before: for each joint, the previous exchange that it answered, or None.
         """
@@ -73,7 +73,7 @@ def _ticks(drive: Joint, angle: float) -> float:
 
 
 def _have_exchanged(own: _Seen, other: _Seen) -> bool:
-    """Whether each of two servos has landed where the other one was; False if a position is NaN."""
+    """Whether each of two servos has landed at the other's former position; False if a position is NaN."""
 
     def distance(first: float, second: float) -> float:
         # Within one turn, because a joint's zero may be shifted by whole turns when the bus is opened.

@@ -67,7 +67,7 @@ def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
 @contextmanager
 def telling_of_torque(bus: ServoBus) -> Iterator[None]:
     """Add a note about torque to any exception that ends the block, unless it already has one: a stop may also occur
-    between two runs. Mark a DriverError that ends the block after this program has switched torque on.
+    between two runs. A DriverError is also marked if this program had switched torque on.
     """
     try:
         yield

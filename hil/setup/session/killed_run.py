@@ -31,7 +31,7 @@ class Left:
 
     kept: the settings before that program. changed: the registers that another program has changed since then, each
     with its present value. wanted: the settings to restore; the changed registers keep their present values.
-    differing: the registers to restore, each with its present value and the one to restore.
+    differing: the registers to restore, each with its present value and the value to restore.
     """
 
     kept: Kept
@@ -99,7 +99,7 @@ def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
 def is_left_on(servo: Servo, kept: Kept) -> bool:
     """Return whether the killed program left this servo's torque on. Raises the errors of `Servo.read`.
 
-    If torque is on in another mode than that program's, another program has switched it on since.
+    If torque is on in a mode other than that program's, another program has switched it on since.
     """
     return bool(servo.read("Torque Enable")) and kept.changed.get(_MODE) in (None, servo.read(_MODE))
 
@@ -114,9 +114,9 @@ def switch_off_left(servo: Servo, kept: Kept) -> bool:
         return True
     if servo.read("Torque Enable"):
         raise TorqueHeld(
-            f"{servo.title}: its torque is on in Operating Mode {servo.read(_MODE)}, but the run of {kept.since} that "
-            f"ended without restoring it had set {kept.changed.get(_MODE)}: another program has switched torque on "
-            "since. Stop that program, then try again."
+            f"{servo.title}: its torque is on in Operating Mode {servo.read(_MODE)}, but an earlier run "
+            f"({kept.since}), which ended before it could restore this servo, had set mode {kept.changed.get(_MODE)}: "
+            "another program has switched torque on since. Stop that program, then try again."
         )
     return False
 
@@ -137,7 +137,8 @@ class Restored:
 def recover(servo: Servo, port: str) -> Restored:
     """Restore settings left behind by a terminated program, and switch off torque that it left on.
 
-    Raises the same errors as `Servo.write`, DamagedSettings, and TorqueHeld if another program has switched torque on.
+    Raises the same errors as `Servo.write`, DamagedSettings, and TorqueHeld if another program has switched torque
+    on since.
 
     The file with the earlier settings is kept as long as another program's value prevents a register from being
     restored.

@@ -1,4 +1,4 @@
-"""What killed runs left on the servos of a port, whichever of them the present command's configuration describes."""
+"""What killed runs left on the servos of a port, whether or not the current configuration describes these servos."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -28,12 +28,12 @@ class Leftovers:
     """What a killed run left on one servo.
 
     told: sentences about the run, what differs and the file with the former settings. restore: the command that
-    restores them; "" if none can. trouble: a short description.
+    restores the servo; "" if none can. trouble: a short description.
     """
 
     told: str
     restore: str = ""
-    trouble: str = "settings of a stopped run are not restored"
+    trouble: str = "settings not restored after a killed run"
 
     def __str__(self) -> str:
         fix = f" To switch its torque off and restore its settings, type: {self.restore}"
@@ -49,7 +49,7 @@ def about_leftovers(servo: Servo) -> Leftovers | None:
     try:
         kept = settings_file.load(port.url, servo.id, servo.table.model)
     except DamagedSettings as error:
-        return Leftovers(str(error), trouble="the file with its settings from before a stopped run is damaged")
+        return Leftovers(str(error), trouble="the file with its settings from before a killed run is damaged")
     if kept is None or not kept.may_restore:
         return None
     restore = _restoring(kept, port)
@@ -62,14 +62,14 @@ def about_leftovers(servo: Servo) -> Leftovers | None:
     except PortLost:
         raise
     except DriverError as error:
-        return Leftovers(f"{run}; what it left could not be read: {error} {where}", restore)
+        return Leftovers(f"{run}; what it left behind could not be read: {error} {where}", restore)
     if not (differing or was_left_on):
         return None
     found = ["its torque is still on"] if was_left_on else []
     found += [f"{name} is {now} and was {before}" for name, (now, before) in differing.items()]
     told = f"{run}: {', '.join(found)}. {where}"
     if is_on and not was_left_on:
-        told += " Its torque is on in another mode than that run's: stop the program that is driving it first."
+        told += " Its torque is on in a mode other than that run's: first stop the program that is driving it."
     return Leftovers(told, restore)
 
 
@@ -111,14 +111,14 @@ def _with_leftovers(port: Port, found: Found) -> Found:
 
 
 def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> None:
-    """Restore every servo of this port that a killed run left unrestored and that answers at the port's baud rate.
+    """Restore every servo on this port that a killed run left unrestored and that answers at the port's baud rate.
 
-    Torque that killed runs left on is switched off at all servos first. If another program has switched torque on
-    since, that servo is left as it is.
+    Torque that killed runs left on is first switched off on all servos. A servo on which another program has switched
+    torque on since is left as it is.
 
-    needed: ID of the servo that the caller needs. say: receives a message for each servo that was restored or could not
-    be. Raises PortLost and, once all others have been restored, the error of `recover` for the needed servo if it
-    answers.
+    needed: ID of the servo that the caller needs. say: receives a message for each servo that was or could not be
+    restored. Raises PortLost and, once all other servos have been restored, the error of `recover` for the needed servo
+    if it answers.
     """
     failed: dict[Servo, DriverError] = {}
     was_on: dict[Servo, bool] = {}
@@ -141,14 +141,14 @@ def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> None:
         servo: why for servo, why in failed.items() if servo.id != needed or isinstance(why, WrongModel | NoReply)
     }
     for servo, why in unreached.items():
-        say(f"{servo.title}: what an earlier run left is not restored yet{_file_of(servo)}. {why}")
+        say(f"{servo.title}: not yet restored after an earlier run{_file_of(servo)}. {why}")
     for servo, why in failed.items():
         if servo not in unreached:
             raise why
 
 
 def _on_file(port: Port) -> list[Servo]:
-    """The servos for which there is a file of this port."""
+    """The servos for which there is a file for this port."""
     known = model_names().values()
     return [
         Servo(port, servo_id, load_control_table(model))
@@ -168,7 +168,7 @@ def _file_of(servo: Servo) -> str:
 def _switched_off(servo: Servo) -> bool:
     """Switch off torque that a killed run left on; return whether it was on.
 
-    Raises the errors of `recover`, NoReply, and WrongModel if the servo is of another model than the one on file.
+    Raises the errors of `recover`, NoReply, and WrongModel if the servo's model differs from the one on file.
     """
     if servo.ping() != servo.table.number:
         raise WrongModel(f"Another model answers at ID {servo.id}.")

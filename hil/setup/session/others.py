@@ -15,8 +15,10 @@ _AT_ONCE_S = 0.005
 
 
 class Other(NamedTuple):
-    """A servo that is not part of the arm: its ID and model; the same with its torque; a message about what a killed
-    run left on it, "" if nothing.
+    """A servo that is not part of the arm.
+
+    name: its ID and model. described: the same, and whether its torque is on. left: a message about what a killed run
+    left on it; "" if nothing.
     """
 
     name: str

@@ -24,7 +24,7 @@ _MOST_CHECKS = 3
 class SavedSettings:
     """The settings to restore. Each servo has a file on disk until its settings have been restored.
 
-    say: receives messages for the user. config: absolute path of the arm's configuration, which the files name.
+    say: receives messages for the user. config: absolute path of the arm's configuration, stated in the files.
     """
 
     bus: ServoBus

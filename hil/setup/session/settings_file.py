@@ -139,7 +139,7 @@ def load(port: str, servo_id: int, model: str) -> Kept | None:
 
 
 def servos_on_file(port: str) -> list[tuple[int, str]]:
-    """ID and model of each servo for which there is a file of this port, even a damaged one, ordered by ID."""
+    """ID and model of each servo for which there is a file for this port, even a damaged one, ordered by ID."""
     named = (_FILE_NAME.fullmatch(each.name) for each in state_folder().glob("*.json"))
     return sorted(each for each in {(int(name[1]), name[2]) for name in named if name} if _has_file(port, *each))
 

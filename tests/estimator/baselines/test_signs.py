@@ -125,7 +125,7 @@ def test_quarter_turns_are_preferred_to_an_angle_that_explains_hardly_more() -> 
 
 @pytest.mark.parametrize("turned", [(0.0, 0.0), (np.pi, 0.0), (0.0, np.pi), (np.pi, np.pi)])
 def test_an_origin_that_is_half_a_turn_off_is_found_from_the_sign_of_gravity(turned: tuple[float, float]) -> None:
-    """No residual shows it, because the weights may be negative."""
+    """The residual does not reveal this, because the weights may be negative."""
     motion = two_joints(8.0)
     position = motion.position + np.array(turned)[:, None]
     zeros = turned_zeros([Recording(motion.time, motion.torque, position, np.full(2, 1.5e-3), between="held")])

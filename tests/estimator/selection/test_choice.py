@@ -217,7 +217,7 @@ def test_a_parameter_that_the_motion_does_not_determine_is_not_known_to_within_a
     assert "This motion does not determine coulomb_2. To identify it, use more slow reversals" in said
 
 
-@pytest.mark.parametrize(("ended", "said"), [(True, "the recording ends before that"), (False, "set experiment")])
+@pytest.mark.parametrize(("ended", "said"), [(True, "the recording ends too early"), (False, "set experiment")])
 def test_why_there_is_no_held_out_motion_is_said(ideal_period: SettledPeriod, ended: bool, said: str) -> None:
     plain = identify(ideal_period, Model(2, "coulomb", "lag"), coarse=True)
     evidence = Evidence(None, ended_early=ended)

@@ -92,7 +92,7 @@ def test_files_and_captured_streams_are_left_as_they_are(monkeypatch: pytest.Mon
 
 @pytest.fixture
 def full_pipe() -> Iterator[tuple[int, int]]:
-    """A pipe that holds as much as it can: its reading end, open but idle, and its writing end."""
+    """A full pipe: its reading end, which is open but idle, and its writing end."""
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     with suppress(BlockingIOError):
@@ -106,9 +106,9 @@ def full_pipe() -> Iterator[tuple[int, int]]:
 
 
 def recorded(arm: Path, out: Path, pipe: int, ignored: str = "") -> subprocess.Popen[bytes]:
-    """A process that records a run with this pipe as its standard streams, and has come to its last words.
+    """A process that records a run with this pipe as its standard streams and has reached its final messages.
 
-    ignored: names of signals that are ignored from the start, as shells do for background jobs.
+    ignored: names of signals that are ignored from the start, as in a shell's background jobs.
     """
     words = [sys.executable, "-m", "hil", "record", str(arm), "--out", str(out)]
     shell = ["sh", "-c", f"trap '' {ignored}; exec \"$@\"", "sh"] if ignored else []

@@ -31,7 +31,7 @@ Spoil = Callable[[Recording], Recording]
 
 @dataclass(frozen=True)
 class Estimate:
-    """What widening the standard errors needs of an estimate."""
+    """The parts of an estimate that are needed to widen its standard errors."""
 
     names: tuple[str, ...]
     covariance: np.ndarray
@@ -302,7 +302,7 @@ def test_a_stop_within_the_motion_is_a_cause(has_stop: bool) -> None:
         (
             -1,
             -1,
-            "The direction of shoulder or that of elbow is probably wrong: with angle and torque of elbow",
+            "The direction of shoulder or elbow is probably wrong: with the angle and torque of elbow",
         ),
         (1, -1, "The sign of the torque of elbow is reversed: with the sign changed"),
     ],

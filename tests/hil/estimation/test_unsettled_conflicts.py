@@ -54,7 +54,7 @@ def test_values_far_from_the_files_lower_the_verdict(estimate: Any, given: Given
 
 
 def test_dry_friction_that_is_zero_and_known_to_be_so_is_no_weakness() -> None:
-    """Relative to itself, no error of it is small."""
+    """Relative to a value of zero, no error is small."""
     estimate = estimated()
     place = NAMES.index("coulomb_1")
     estimate.value[place], estimate.std[place] = 1e-12, 1e-5

@@ -245,8 +245,8 @@ def test_teeth_that_change_sides_at_two_reversals_are_no_jolt() -> None:
 
 @pytest.mark.parametrize(("jump", "later", "seen"), [(2.5, 1.0, False), (3.5, 1.0, True), (2.5, 12.0, True)])
 def test_a_jolt_is_larger_than_single_impacts_before_it(jump: float, later: float, seen: bool) -> None:
-    """A gear with much play: each tooth that meets the other flank changes the velocity, and two may follow each other
-    by chance, as on an XM540 with 0.5 degrees of play.
+    """A gear with much backlash: each tooth that strikes the opposite flank changes the velocity, and two impacts may
+    follow each other by chance, as on an XM540 with a backlash of 0.5 degrees.
     """
     velocities = [3.0] * 40 + [5.0] * round(100 * later) + [5.0 - jump] * 5 + [5.0] * 20
     assert (jolt(velocities) is not None) is seen

@@ -95,7 +95,7 @@ def test_no_current_in_the_direction_in_which_the_position_moves(arm: Arm, inter
 
 @pytest.mark.parametrize(("more", "goes_on"), [(1.1, True), (1.3, False)])
 def test_a_joint_that_is_still_faster_after_a_while_ends_it(arm: Arm, more: float, goes_on: bool) -> None:
-    """As with a reversed motor that may run at 20 rad/s: after 20 ms, 6 % of this is too much."""
+    """As with a reversed motor whose limit is 20 rad/s: after 20 ms, an increase of 6 % of this is too much."""
     brake = brake_of(arm(), MOVING)
     faster = MOVING._replace(velocity=(0.0, -4.0 - more))
     goals = [brake.goals(each) for each in (MOVING, *8 * [faster])]

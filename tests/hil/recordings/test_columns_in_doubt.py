@@ -171,12 +171,12 @@ def test_a_torque_unit_needs_no_space(unit: str) -> None:
 @pytest.mark.parametrize(
     ("head", "keys", "size", "said"),
     [
-        ("tau", {}, 300.0, "would be 300 N m: more than any servo. Is it in mN m? Then append [mN m]"),
+        ("tau", {}, 300.0, "would be 300 N m: too much for any servo. Is it in mN m? Then append [mN m]"),
         ("tau", {}, 50.0, ""),
         ("tau [N m]", {}, 300.0, ""),
         ("tau [mN m]", {}, 300.0, ""),
         ("tau", {"torque_unit": "N m"}, 300.0, ""),
-        ("current", {"torque_constant": [1.8]}, 700.0, "reaches 700, which would be 700 A: more than any servo. Is it"),
+        ("current", {"torque_constant": [1.8]}, 700.0, "700, which would be 700 A: too much for any servo. Is it"),
         ("current [mA]", {"torque_constant": [1.8]}, 700.0, ""),
     ],
 )

@@ -1,4 +1,4 @@
-"""Jumps of the position are detected; encoder noise is not, whether the joint moves or rests."""
+"""Jumps of the position are detected; encoder noise is not mistaken for them, whether the joint moves or rests."""
 
 import math
 from random import Random
@@ -37,9 +37,7 @@ def test_a_creep_slower_than_a_tick_of_velocity_is_taken_for_rounding() -> None:
 
 @pytest.mark.parametrize(("jumps", "seen"), [((0.4, 0.5, 0.6), False), ((0.4, 0.5, 0.6, 0.7), True)])
 def test_four_jumps_are_too_many(jumps: tuple[float, ...], seen: bool) -> None:
-    """Back and forth, so that nothing accumulates; each pair of steps is one jump, the return being half of the
-    next.
-    """
+    """Back and forth, so that nothing accumulates. Each pair of steps is one jump; the return is half of the next."""
     times = [round(400 * jump) for jump in jumps]
 
     def position(now: float) -> float:
@@ -52,7 +50,7 @@ def test_four_jumps_are_too_many(jumps: tuple[float, ...], seen: bool) -> None:
 @pytest.mark.parametrize("noise", [1.0, 1.5, 2.0, 2.5])
 @pytest.mark.parametrize("resting", [0.5, 1.0])
 def test_noise_of_a_joint_that_stands_still_does_not_accumulate(rate: int, noise: float, resting: float) -> None:
-    """A fifth of this noise's changes are larger than a jump; their sum over 30 s would be more than any tolerance.
+    """A fifth of the changes due to this noise exceed a jump; their sum over 30 s would exceed any tolerance.
 
     resting: fraction of the time in which the joint stands still.
     """

@@ -1,4 +1,4 @@
-"""Replies of two servos that are swapped during a run are named, and not blamed on an encoder or a horn."""
+"""If the replies of two servos are swapped during a run, the message says so and blames no encoder or horn."""
 
 import re
 from collections.abc import Callable
@@ -77,7 +77,7 @@ def test_the_two_servos_of_one_joint_may_be_swapped(direction: int) -> None:
 
 
 def swapping(first: int, second: int, since: float) -> Callable[[Converter, tuple[int, ...], Reply], State]:
-    """Return a `Converter.state` that exchanges the answers of two servos, counted from 0, from a time on [s]."""
+    """Return a `Converter.state` that exchanges the answers of two servos, counted from 0, from a given time on [s]."""
     convert = Converter.state
 
     def state(self: Converter, ticks: tuple[int, ...], reply: Reply) -> State:

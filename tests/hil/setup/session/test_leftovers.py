@@ -1,4 +1,4 @@
-"""What a killed run left is restored by `hil setup` on all servos of the port, and named by every other command."""
+"""`hil setup` restores what a killed run left on all servos of the port; every other command reports it."""
 
 import json
 import re
@@ -29,7 +29,7 @@ WHAT = "settings from an earlier run"
 
 @pytest.fixture
 def kill(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], None]:
-    """Kills a run while torque is on: nothing leaves the program any more, and the watchdogs trip."""
+    """Kills a run while torque is on: the program sends nothing more, and the watchdogs trip."""
 
     def killed(config: Config) -> None:
         with (
@@ -54,7 +54,7 @@ def _lost(_: bytes) -> int:
 
 
 def torque_on(bench: Bench, servo: int, mode: int) -> None:
-    """What another program does that moves a servo."""
+    """Do what another program does to move a servo."""
     for register, value in ((64, 0), (98, 0), (11, mode), (64, 1)):
         bench.servos[servo].write(register, bytes((value,)))
     assert bench.servos[servo].torque_enabled
@@ -73,7 +73,7 @@ def elbow_only(path: Path) -> Config:
 
 
 def shared(config: Config, path: Path) -> Config:
-    """The same port for another configuration: that of a fake arm is the file that describes it."""
+    """Let a configuration use the port of the fake arm that the file `path` describes."""
     port = config.port.model_copy(update={"url": f"fake://{path}"})
     return config.model_copy(update={"port": port})
 
@@ -114,7 +114,7 @@ def test_setup_restores_the_other_servos_too_if_torque_is_off_already(
 def test_setup_does_not_cut_torque_that_another_program_has_switched_on_since(
     arm: Arm, bench: Bench, kill: Any, capsys: pytest.CaptureFixture[str], needed: int
 ) -> None:
-    """In position mode it holds the arm, which would fall."""
+    """In position mode, the servo holds the arm, which would otherwise fall."""
     config = arm(SHORT)
     kill(config)
     torque_on(bench, 2, POSITION_MODE)
@@ -163,12 +163,12 @@ def test_setup_names_the_servos_that_it_cannot_restore(
     assert hil("setup", config.url, "--id", 1) == 0
     (waiting,) = state_folder.glob("*.json")
     said = capsys.readouterr().err
-    assert f"ID 2: what an earlier run left is not restored yet ({waiting}). " in said and "does not answer" in said
+    assert f"ID 2: not yet restored after an earlier run ({waiting}). " in said and "does not answer" in said
     assert {each.split(" of ")[1][0] for each in bench.changed()} == {"2"}
     bench.port.bus.faults.clear()
     waiting.write_text("{", encoding="utf-8")
     assert hil("setup", config.url, "--id", 1) == 0
-    assert f"is not restored yet. {waiting} is damaged" in capsys.readouterr().err
+    assert f"not yet restored after an earlier run. {waiting} is damaged" in capsys.readouterr().err
     assert hil("setup", config.url, "--id", 2) == 2
     assert bench.servos[2].torque_enabled, "its own program is not known"
 
@@ -238,7 +238,7 @@ def test_scan_names_what_a_killed_run_left_and_the_command_that_restores_it(
     kill(config)
     before = bench.changed()
     out = scanned(config, capsys)
-    assert out.count("torque on; watchdog tripped; settings of a stopped run are not restored") == 2
+    assert out.count("torque on; watchdog tripped; settings not restored after a killed run") == 2
     assert f"{config.path}) ended before it could restore this servo: its torque is still on, Operating Mode" in out
     assert out.splitlines()[-1] == f"Next: hil check {config.path}"
     assert bench.changed() == before and len(list(state_folder.glob("*.json"))) == 2, "nothing is written"
@@ -315,7 +315,7 @@ def test_a_process_killed_in_its_run_is_named_by_scan_and_restored_by_setup(
         assert f"hil check {real}" in " ".join(capsys.readouterr().out.split())
         assert hil("scan", link, "--baud", 1_000_000) == 0
         out = capsys.readouterr().out
-        assert "torque on; watchdog tripped; settings of a stopped run are not restored" in out
+        assert "torque on; watchdog tripped; settings not restored after a killed run" in out
         assert out.splitlines()[-1] == f"Next: hil check {real}"
         assert hil("setup", link, "--id", 1) == 0
         with ServoBus.connect(load_config(real).bus) as bus:
