@@ -87,7 +87,12 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
     ),
     FaultKind.SILENT_SERVO: FaultFacts("a servo's bus cable is disconnected; its motor keeps running"),
     FaultKind.REBOOT: FaultFacts("a servo reboots after a dip in its supply voltage", "seconds without response", 0.25),
-    FaultKind.OVERHEATING: FaultFacts("a servo is hotter than its Temperature Limit", "kelvin above it", 10),
+    FaultKind.OVERHEATING: FaultFacts(
+        "a servo is hotter than its Temperature Limit; when the fault ends, it cools by 10 K/s, unless its [thermal] "
+        "table cools it from the start",
+        "kelvin above it",
+        10,
+    ),
     FaultKind.OVERLOAD: FaultFacts("a servo reports overload"),
     FaultKind.LOW_VOLTAGE: FaultFacts("the supply falls below a servo's Min Voltage Limit", "volts below it", 1.0),
     FaultKind.STUCK_JOINT: FaultFacts("a joint is jammed"),
@@ -158,9 +163,13 @@ Effect = Callable[[Fault], None]
 
 
 class Faults:
-    """The faults of one bus: pending ones, active ones, and a record of those that took effect (`happened`)."""
+    """The faults of one bus: pending ones, active ones, and a record of those that took effect (`happened`).
 
-    def __init__(self, seed: int, begin: Effect, end: Effect) -> None:
+    begin, end: apply a fault to the servos, and undo it. catch_up: advances the bus to the present, so that what is
+    added or cleared now does not take effect at the time of the last packet.
+    """
+
+    def __init__(self, seed: int, begin: Effect, end: Effect, catch_up: Callable[[], None] = lambda: None) -> None:
         self.happened: list[Happened] = []
         self.next_change = math.inf
         """Time at which the next fault begins or ends [s since the bus was created]."""
@@ -169,6 +178,7 @@ class Faults:
         self.on_instructions: list[Fault] = []
         self.on_answers: list[Fault] = []
         self.random = Random(f"faults {seed}")
+        self._catch_up = catch_up
         self._begin = begin
         self._end = end
         self._to_come: list[Fault] = []
@@ -177,11 +187,13 @@ class Faults:
 
     def add(self, *faults: Fault) -> None:
         """Add faults; those whose start time has passed begin immediately."""
+        self._catch_up()
         self._to_come.extend(faults)
         self._look_ahead()
 
     def clear(self) -> None:
         """End all active faults and cancel the pending ones."""
+        self._catch_up()
         self._to_come.clear()
         for fault in list(self._lasting):
             self._finish(fault)

@@ -219,6 +219,53 @@ def test_hardware_errors(bench: Any, kind: str, error: HardwareError, shuts_down
     assert bench.servo(2).value("Present Input Voltage") == 120
 
 
+@pytest.mark.parametrize("how", ["duration", "clear"])
+def test_an_overheated_servo_recovers_after_cooling(bench: Any, how: str) -> None:
+    bench.arm(1, goal_ticks=100)
+    fault = Fault(kind="overheating", servo=1, at=0.5, **({"duration": 20.0} if how == "duration" else {}))
+    bench.bus.faults.add(fault)
+    bench.clock.wait_until(20.49)
+    assert bench.servo().value("Present Temperature") == 90, "it stays hot as long as the fault lasts"
+    bench.clock.wait_until(20.5)
+    if how == "clear":
+        bench.bus.faults.clear()
+    assert bench.servo().temperature_c == pytest.approx(90, abs=0.2)
+    bench.ask(1, Instruction.REBOOT)
+    bench.wait(BOOT_S)
+    assert bench.servo().hardware_error == HardwareError.OVERHEATING, "it is still too hot"
+    bench.clock.wait_until(22.5)
+    assert bench.servo().temperature_c == pytest.approx(70, abs=0.2)
+    bench.ask(1, Instruction.REBOOT)
+    bench.wait(BOOT_S)
+    assert bench.servo().hardware_error == 0
+    bench.arm(1, goal_ticks=100)
+    bench.wait(3600.0)
+    assert bench.servo().value("Present Temperature") == 35
+    assert bench.servo().torque_enabled
+    assert not bench.servo().needs_ticks, "it costs nothing any more"
+
+
+def test_a_servo_that_two_faults_heat_cools_after_both(bench: Any) -> None:
+    bench.bus.faults.add(
+        Fault(kind="overheating", servo=1, at=1.0, duration=2.0), Fault(kind="overheating", at=2.0, duration=5.0)
+    )
+    for second, temperature in ((0.9, 35), (2.9, 90), (6.9, 90), (8.0, 80), (20.0, 35)):
+        bench.clock.wait_until(second)
+        assert bench.servo().value("Present Temperature") == temperature
+
+
+def test_what_is_cleared_or_added_now_takes_effect_now(bench: Any) -> None:
+    """Not at the time of the last packet, up to which the bus has been computed."""
+    bench.bus.faults.add(Fault(kind="overheating"))
+    bench.wait(10.0)
+    bench.bus.faults.clear()
+    assert bench.servo().value("Present Temperature") == 90
+    bench.wait(10.0)
+    bench.bus.faults.add(Fault(kind="reboot"))
+    bench.wait(0.9 * BOOT_S)
+    assert raw_replies(bench) == [b""]
+
+
 def test_encoder_jump_and_back(bench: Any) -> None:
     bench.bus.faults.add(Fault(kind="encoder_jump", servo=1, at=1.0, duration=1.0, amount=-300))
     assert bench.read(1, 132, 4, signed=True) == 0
