@@ -37,7 +37,9 @@ class FakeServo(Described):
 
     id: Annotated[int, Field(ge=0, le=MAX_ID, description="bus ID")]
     model: Annotated[str, Field(description='name as printed on the servo, e.g. "XM430-W350"')]
-    zero_ticks: Annotated[int, Field(description="Present Position at which the joint's angle is 0")]
+    zero_ticks: Annotated[
+        int, Field(ge=-(1 << 20), le=1 << 20, description="Present Position at which the joint's angle is 0")
+    ]
     direction: Annotated[int, Field(description="-1 if the servo turns in the opposite direction to the joint")] = 1
     joint: Annotated[
         int | None,

@@ -73,7 +73,8 @@ def put_with_faults(faults: Faults, wire: "Wire", servo_id: int, data: bytes, st
             case FaultKind.LOST_REPLY:
                 copies = 0
             case FaultKind.CORRUPTED_REPLY:
-                data = _flipped(data, [random.randrange(8 * len(data)) for _ in range(round(fault.size))])
+                bits = range(8 * len(data))
+                data = _flipped(data, random.sample(bits, min(round(fault.size), len(bits))))
             case FaultKind.TRUNCATED_REPLY:
                 data = data[: random.randrange(1, len(data))]
             case FaultKind.DUPLICATED_REPLY:

@@ -30,6 +30,13 @@ _PULL_S = 0.01
 """Time constant with which the hand corrects the joint's deviation from the planned path [s]."""
 
 
+_FASTEST_RAD_S = 200.0
+"""Greatest mean velocity of a movement [rad/s]; simulated gears and stops do not survive much more."""
+
+_MOST_TICKS = 1 << 20
+"""Largest Present Position of a servo in either direction: 256 turns."""
+
+
 class Move(Described):
     """One movement of the hand, after which it holds the joint for `hold` seconds; by default, indefinitely."""
 
@@ -38,11 +45,20 @@ class Move(Described):
         float | None,
         Field(ge=-4 * PI, le=4 * PI, allow_inf_nan=False, description="joint angle at the end [rad]"),
     ] = None
-    ticks: Annotated[int | None, Field(description="Present Position at the end, instead of `to`")] = None
+    ticks: Annotated[
+        int | None,
+        Field(ge=-_MOST_TICKS, le=_MOST_TICKS, description="Present Position at the end, instead of `to` [ticks]"),
+    ] = None
     at: Annotated[float, Field(ge=0, le=86400, allow_inf_nan=False, description="delay before the start [s]")] = 0.0
-    duration: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False, description="duration of the movement [s]")] = (
-        1.0
-    )
+    duration: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=600,
+            allow_inf_nan=False,
+            description="duration of the movement [s]; longer above 200 rad/s on average",
+        ),
+    ] = 1.0
     hold: Annotated[float, Field(ge=0, description="how long the joint is held afterwards [s]")] = math.inf
 
     @model_validator(mode="after")
@@ -150,7 +166,8 @@ class Hand:
         if end is None:
             servo = next(servo for servo in self._joints.of_joint(joint) if servo.id == move.servo)
             end = servo.present.angle(move.ticks or 0)
-        self._grips[joint] = _Grip(joint, start, end, now, move.duration, now + move.duration + move.hold)
+        duration = max(move.duration, abs(end - start) / _FASTEST_RAD_S)
+        self._grips[joint] = _Grip(joint, start, end, now, duration, now + duration + move.hold)
 
     def _driven(self, joint: int) -> bool:
         return any(servo.torque_enabled for servo in self._joints.of_joint(joint))

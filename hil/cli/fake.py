@@ -42,7 +42,7 @@ def describe_fake(config: Path, faults: list[str], moves: list[str], seed: int |
 
 def list_faults() -> None:
     for kind, facts in FAULTS.items():
-        amount = f"; amount: {facts.amount}, default {facts.default:g}" if facts.amount else ""
+        amount = f"; amount: {facts.allowed}, default {facts.default:g}" if facts.amount else ""
         print(f"{kind:22s} {facts.does}{amount}")
 
 

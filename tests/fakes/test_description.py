@@ -76,6 +76,7 @@ def test_servos_may_have_the_same_id(tmp_path: Path) -> None:
         (FIRST, FIRST + "baud = 9601\n", ["fake.servos[1].baud = 9601", "57600", "are allowed"]),
         (FIRST, FIRST + "direction = 0\n", ["fake.servos[1].direction = 0", "1 or -1 is allowed"]),
         (FIRST, FIRST + "return_delay_us = 7\n", ["fake.servos[1].return_delay_us = 7", "multiple of 2"]),
+        (FIRST, FIRST.replace("3072", "10_000_000"), ["fake.servos[1].zero_ticks = 10000000", "at most 1048576"]),
         (FIRST, FIRST.replace("W350", "W351"), ["fake.servos[1].model = 'XM430-W351'", "did you mean XM430-W350?"]),
         (FIRST, FIRST.replace("XM430-W350", "motor"), ["fake.servos[1].model = 'motor'", "XM430-W350, XM430-W210"]),
         (FIRST, FIRST.replace("id = 1", "id = 253"), ["fake.servos[1].id = 253", "252"]),

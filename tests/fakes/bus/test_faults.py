@@ -1,6 +1,7 @@
 """Every fault happens at its time, to its servo, with its probability, and reproducibly for the same seed."""
 
 import termios
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -398,6 +399,60 @@ def test_wrong_on_the_command_line(text: str, said: str) -> None:
     with pytest.raises(ValueError, match="fault") as caught:
         parse_fault(text)
     assert said in str(caught.value)
+
+
+WRONG_AMOUNTS = [
+    ("noise", -5, "a whole number from 1 to 1000 (bytes)"),
+    ("noise", 1e9, "a whole number from 1 to 1000 (bytes)"),
+    ("encoder_jump", 1e12, "a whole number from -1048576 to 1048576 (ticks)"),
+    ("status_error", 300, "a whole number from 1 to 255 (ERR byte)"),
+    ("status_error", -1, "a whole number from 1 to 255"),
+    ("status_error", 1.5, "a whole number from 1 to 255"),
+    ("corrupted_reply", 0, "a whole number from 1 to 88 (bits)"),
+    ("reboot", -1, "a number from 0 to 3600 (seconds without response)"),
+    ("late_reply", -1, "a number from 1e-06 to 3600 (seconds)"),
+    ("other_master", 0, "a number from 0.001 to 3600"),
+    ("low_voltage", -1, "a number from 0.1 to 40 (volts below it)"),
+    ("overheating", -1, "a number from 1 to 150 (kelvin above it)"),
+    ("lost_reply", 1, "lost_reply has no amount"),
+]
+
+
+@pytest.mark.parametrize(("kind", "amount", "said"), WRONG_AMOUNTS)
+def test_a_wrong_amount_is_refused_wherever_it_comes_from(
+    bench: Any, tmp_path: Path, kind: str, amount: float, said: str
+) -> None:
+    given = f"amount = {float(amount)!r}: "
+    fault = Fault(kind=kind)
+    attempts: dict[str, Callable[[], object]] = {
+        "the command line": lambda: parse_fault(f"{kind}:amount={amount}"),
+        "TOML": lambda: load_fake(with_fault(tmp_path, f'kind = "{kind}"\namount = {float(amount)}')),
+        "Python": lambda: Fault(kind=kind, amount=float(amount)),
+        "while running": lambda: bench.bus.faults.add(fault.model_copy(update={"amount": float(amount)})),
+    }
+    for source, attempt in attempts.items():
+        with pytest.raises(ValueError, match="amount = ") as caught:
+            attempt()
+        assert given in str(caught.value), source
+        assert said in str(caught.value), source
+
+
+@pytest.mark.parametrize("kind", [kind for kind, facts in FAULTS.items() if facts.amount])
+@pytest.mark.parametrize("end", ["least", "most"])
+def test_every_allowed_amount_works(kind: FaultKind, end: str) -> None:
+    port = open_fake(load_fake(CONFIG))
+    port.bus.faults.add(Fault(kind=kind, amount=getattr(FAULTS[kind], end)))
+    for _ in range(3):
+        port.write(PING)
+        port.read(14)
+    port.write(encode(1, Instruction.READ, b"\x78\0\x1c\0"))
+    port.read(39)
+    assert FAULTS[kind].allows(FAULTS[kind].default)
+
+
+def test_flipping_many_bits_of_a_short_reply(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="truncated_reply"), Fault(kind="corrupted_reply", amount=88))
+    assert all(1 <= len(raw) < len(PONG) for raw in raw_replies(bench, 20))
 
 
 def with_fault(tmp_path: Path, fault: str) -> Path:

@@ -75,6 +75,15 @@ def test_a_move_can_end_at_ticks_and_be_released(make_bench: Callable[..., Any])
     assert not bench.bus.hand.busy
 
 
+@pytest.mark.parametrize("end", [{"ticks": 1 << 20}, {"to": -12.5}])
+def test_a_hand_that_is_told_to_be_quick_is_as_fast_as_it_can_be(end: dict[str, Any]) -> None:
+    bench = on_bench(described(DRIVE, 1))
+    bench.bus.hand.move(Move(servo=1, duration=1e-9, **end))
+    bench.wait(10.0)
+    expected = end.get("ticks", 2048 - 12.5 * 4096 / math.tau)
+    assert bench.read(1, 132, 4, signed=True) == pytest.approx(expected, abs=4)
+
+
 def test_ticks_are_those_of_present_position_whatever_shifts_it() -> None:
     description = described(DRIVE, 1)
     servo = description.servos[0].model_copy(
