@@ -72,6 +72,13 @@ class EmulatedModel:
     registers: Mapping[str, Register]
 
 
+def allowed_values(model: EmulatedModel, register: Register) -> range | frozenset[int]:
+    """Return the values that a servo of this model accepts in this register."""
+    if register.name == "Operating Mode" and model.operating_modes:
+        return model.operating_modes
+    return range(register.minimum, register.maximum + 1)
+
+
 MODEL_NAMES = tuple(FACTS)
 """Servo models with known factory values and ranges."""
 

@@ -83,6 +83,24 @@ def test_servos_may_have_the_same_id(tmp_path: Path) -> None:
         (FIRST, "", ["1 servos for 2 drives"]),
         (FIRST, FIRST + 'registers = { "Goal Current" = 1 }\n', ["Goal Current", "not a settable EEPROM register"]),
         (FIRST, FIRST + 'registers = { "Shutdown" = 256 }\n', ["Shutdown", "0 to 255 is allowed"]),
+        (FIRST, FIRST + 'registers = { "ID" = 7 }\n', ['fake.servos[1]: registers: "ID" = 7', "the key id sets it"]),
+        (FIRST, FIRST + 'registers = { "Baud Rate" = 1 }\n', ['"Baud Rate" = 1', "the key baud sets it"]),
+        (FIRST, FIRST + 'registers = { "Return Delay Time" = 1 }\n', ["the key return_delay_us sets it"]),
+        (
+            FIRST,
+            FIRST + 'registers = { "Operating Mode" = 2 }\n',
+            ['"Operating Mode" = 2', "0, 1, 3, 4, 5 or 16 is allowed for the XM430-W350"],
+        ),
+        (
+            FIRST,
+            FIRST.replace("XM430-W350", "XL430-W250") + 'registers = { "Operating Mode" = 0 }\n',
+            ['"Operating Mode" = 0', "1, 3, 4 or 16 is allowed for the XL430-W250"],
+        ),
+        (
+            FIRST,
+            FIRST.replace("XM430-W350", "XL330-M288") + "baud = 4_500_000\n",
+            ["fake.servos[1]: baud = 4500000", "at most 4000000 is allowed for the XL330-M288"],
+        ),
         ("gear_ratio = 353.5", "gear_ratio = 0.0", ["fake.arm.drives[1].gear_ratio = 0.0", "greater than 0"]),
     ],
 )
