@@ -303,5 +303,5 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
         seed=fake.seed,
     )
     bus.faults.add(*fake.faults)
-    bus.hand.move(*fake.moves)
+    bus.hand.schedule(*fake.moves)
     return bus

@@ -115,8 +115,19 @@ class Hand:
     def move(self, *moves: Move) -> None:
         """Schedule moves, each `at` seconds from now.
 
-        Raises PlantError if the plant's joints cannot be held, ValueError for an ID that no servo has.
+        Raises PlantError if the plant's joints cannot be held, ValueError for an ID that no servo has, and for a move
+        that starts now while its joint's torque is on. One that starts later is skipped if torque is on by then.
         """
+        for move in moves:
+            if move.at == 0.0 and (driving := self._driving(self._joint_of(move))):
+                raise ValueError(
+                    f"the torque of servo {driving[0]} is on, and the hand moves only joints whose torque is off: "
+                    "write 0 to its Torque Enable first"
+                )
+        self.schedule(*moves)
+
+    def schedule(self, *moves: Move) -> None:
+        """Schedule moves as `move` does; one whose joint's torque is on when it should start is skipped."""
         now = self._time()
         free = {self._joint_of(move) for move in moves} - self._grips.keys()
         if moves and not isinstance(self._plant, CanBeHeld):
@@ -145,7 +156,7 @@ class Hand:
         while self._to_come and self._to_come[0].at <= now:
             self._take(self._to_come.pop(0), now)
         for grip in list(self._grips.values()):
-            if now >= grip.until or self._driven(grip.joint):
+            if now >= grip.until or self._driving(grip.joint):
                 self._let_go(grip.joint)
                 continue
             share = min((now - grip.began) / grip.duration, 1.0)
@@ -159,7 +170,7 @@ class Hand:
 
     def _take(self, move: Move, now: float) -> None:
         joint = self._joint_of(move)
-        if self._driven(joint):
+        if self._driving(joint):
             return
         start = self._plant.position[joint]
         end = move.to
@@ -169,8 +180,9 @@ class Hand:
         duration = max(move.duration, abs(end - start) / _FASTEST_RAD_S)
         self._grips[joint] = _Grip(joint, start, end, now, duration, now + duration + move.hold)
 
-    def _driven(self, joint: int) -> bool:
-        return any(servo.torque_enabled for servo in self._joints.of_joint(joint))
+    def _driving(self, joint: int) -> list[int]:
+        """Return the IDs of the joint's servos whose torque is on."""
+        return [servo.id for servo in self._joints.of_joint(joint) if servo.torque_enabled]
 
     def _let_go(self, joint: int) -> None:
         del self._grips[joint]

@@ -111,6 +111,18 @@ def test_the_hand_lets_go_when_torque_comes_on() -> None:
     assert bench.read(1, 132, 4, signed=True) > 2150  # free to follow its goal
 
 
+def test_the_hand_refuses_to_move_a_joint_whose_torque_is_on() -> None:
+    bench = on_bench(described(DRIVE))
+    assert bench.write(2, 64, 1) == 0
+    with pytest.raises(ValueError, match="the torque of servo 2 is on"):
+        bench.bus.hand.move(Move(servo=1, to=0.0), Move(servo=2, to=0.0))
+    assert not bench.bus.hand.busy, "neither of the two moves"
+    bench.bus.hand.move(Move(servo=2, to=0.5, at=1.0))
+    assert bench.write(2, 64, 0) == 0
+    bench.wait(3.0)
+    assert bench.read(2, 132, 4, signed=True) == pytest.approx(2048 + 326, abs=12)
+
+
 def test_release_forgets_what_was_to_come() -> None:
     bench = on_bench(described(DRIVE))
     bench.bus.hand.move(Move(servo=1, to=0.0, at=0.5), Move(servo=2, to=1.0, at=0.5))
