@@ -82,13 +82,13 @@ class FaultFacts(NamedTuple):
 
 FAULTS: Mapping[FaultKind, FaultFacts] = {
     FaultKind.LOST_REPLY: FaultFacts("a status packet never reaches the host"),
-    FaultKind.CORRUPTED_REPLY: FaultFacts("bits of a status packet are flipped", "bits", 1, 1, 88, True),
+    FaultKind.CORRUPTED_REPLY: FaultFacts("bits of a status packet are flipped", "bits", 1, 1, 88, whole=True),
     FaultKind.TRUNCATED_REPLY: FaultFacts("a status packet ends early"),
     FaultKind.DUPLICATED_REPLY: FaultFacts("a status packet arrives twice"),
     FaultKind.LATE_REPLY: FaultFacts(
         "the adapter delays a status packet and all bytes after it", "seconds", 0.02, 1e-6, 3600
     ),
-    FaultKind.NOISE: FaultFacts("random bytes precede a status packet", "bytes", 8, 1, 1000, True),
+    FaultKind.NOISE: FaultFacts("random bytes precede a status packet", "bytes", 8, 1, 1000, whole=True),
     FaultKind.LOST_INSTRUCTION: FaultFacts("an instruction packet is lost on its way to one servo, or to all servos"),
     FaultKind.CORRUPTED_INSTRUCTION: FaultFacts(
         "an instruction packet arrives with a wrong CRC at one servo, or at all servos"
@@ -100,7 +100,7 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
         1,
         1,
         255,
-        True,
+        whole=True,
     ),
     FaultKind.OTHER_MASTER: FaultFacts(
         "another program on the bus keeps requesting a servo's position", "seconds between requests", 0.01, 1e-3, 3600
@@ -122,9 +122,7 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
         "the supply falls below a servo's Min Voltage Limit", "volts below it", 1.0, 0.1, 40
     ),
     FaultKind.STUCK_JOINT: FaultFacts("a joint is jammed"),
-    FaultKind.ENCODER_JUMP: FaultFacts(
-        "an encoder's position reading is offset", "ticks", 512, -(1 << 20), 1 << 20, True
-    ),
+    FaultKind.ENCODER_JUMP: FaultFacts("an encoder's position reading is offset", "ticks", 512, -1e6, 1e6, whole=True),
     FaultKind.CABLE_PULLED: FaultFacts(
         "the adapter's cable is unplugged, and replugged when the fault ends; the port must be reopened"
     ),

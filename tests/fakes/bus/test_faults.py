@@ -404,7 +404,7 @@ def test_wrong_on_the_command_line(text: str, said: str) -> None:
 WRONG_AMOUNTS = [
     ("noise", -5, "a whole number from 1 to 1000 (bytes)"),
     ("noise", 1e9, "a whole number from 1 to 1000 (bytes)"),
-    ("encoder_jump", 1e12, "a whole number from -1048576 to 1048576 (ticks)"),
+    ("encoder_jump", 1e12, "a whole number from -1000000 to 1000000 (ticks)"),
     ("status_error", 300, "a whole number from 1 to 255 (ERR byte)"),
     ("status_error", -1, "a whole number from 1 to 255"),
     ("status_error", 1.5, "a whole number from 1 to 255"),
