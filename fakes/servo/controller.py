@@ -124,12 +124,11 @@ class Controller:
         if goals is None:
             return 0.0
         back = model.back_emf_v_s * velocity
-        limit = goals.pwm_limit
+        limit = min(goals.pwm_limit, abs(goals.pwm))
         if goals.mode == CURRENT_MODE:
             wanted = goals.current * model.current_unit_a
         elif goals.mode == CURRENT_POSITION_MODE:
             wanted = self._position_control(goals, position_ticks, abs(goals.current)) * model.current_unit_a
-            limit = abs(goals.pwm)
         else:
             pwm = self._pwm(goals, position_ticks, velocity * _TICKS_PER_RAD_S)
             wanted = (pwm / FULL_PWM * supply_v - back) / model.resistance_ohm
