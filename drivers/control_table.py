@@ -7,11 +7,12 @@ tab-separated).
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 
-from hil.drivers.errors import UnknownModel
+from hil.drivers.errors import NoControlTables, UnknownModel
 
 _SIGNED = frozenset(
     {
@@ -74,16 +75,32 @@ class ControlTable:
 def _folder() -> Path:
     # find_spec does not import the package, which would load far more than the data files.
     spec = find_spec("dynamixel_easy_sdk")
-    if spec is None or spec.origin is None:
-        raise UnknownModel(
-            "The package dynamixel-sdk (4.1 or newer), which provides the control tables, is not installed."
-        )
-    return Path(spec.origin).parent / "control_table"
+    folder = None if spec is None or spec.origin is None else Path(spec.origin).parent / "control_table"
+    if folder is None or not (folder / "dynamixel.model").is_file():
+        raise NoControlTables(_what_is_installed())
+    return folder
+
+
+def _what_is_installed() -> str:
+    """Say why there are no control tables, and what to do."""
+    needed = "hil reads the servos' control tables from the package dynamixel-sdk, version 4.1 or newer"
+    try:
+        installed = version("dynamixel-sdk")
+    except PackageNotFoundError:
+        return f"{needed}, which is not installed. Install hil again, with its dependencies."
+    return (
+        f"{needed}, but {installed} is installed, probably because another package needs an older one. Give hil an "
+        'environment of its own and start its fake arms with hil fake --pty: see docs/fake_bus_in_ci.md, "Programs '
+        'that need an older dynamixel-sdk".'
+    )
 
 
 @cache
 def model_names() -> Mapping[int, str]:
-    """Return the model names as printed on the servos, by model number, for every model with a control table."""
+    """Return the model names as printed on the servos, by model number, for every model with a control table.
+
+    Raises NoControlTables.
+    """
     names: dict[int, str] = {}
     for line in (_folder() / "dynamixel.model").read_text(encoding="utf-8").splitlines()[1:]:
         number, _, file = line.partition("\t")
@@ -94,7 +111,7 @@ def model_names() -> Mapping[int, str]:
 
 @cache
 def load_control_table(model: str) -> ControlTable:
-    """Return the control table of a model, e.g. "XM430-W350"; raises UnknownModel."""
+    """Return the control table of a model, e.g. "XM430-W350"; raises UnknownModel, NoControlTables."""
     for number, name in model_names().items():
         if name == model.upper():
             file = _folder() / f"{name.lower().replace('-', '_')}.model"

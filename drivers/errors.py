@@ -5,6 +5,7 @@ __all__ = [
     "BusShared",
     "DriverError",
     "InconsistentReplies",
+    "NoControlTables",
     "NoReply",
     "NotPermitted",
     "PortLost",
@@ -36,6 +37,12 @@ class DriverError(Exception):
 
 class UnknownModel(DriverError):
     """No control table describes this model. Example: `model = "XM430-W351"` in the TOML."""
+
+
+class NoControlTables(DriverError):
+    """The installed dynamixel-sdk has no control tables. Example: a package that needs version 3 was installed later,
+    into the same environment.
+    """
 
 
 class PortNotOpened(DriverError):

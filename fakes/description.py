@@ -1,5 +1,6 @@
 """The [fake] table of an arm's TOML file: the fake servos on the bus, and the mechanism that they move."""
 
+from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -20,7 +21,7 @@ from hil.fakes.plants.errors import PlantError
 from hil.fakes.plants.plant import Plant, load_plant, make_chain, make_plant
 from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
-from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
+from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, allowed_values, load_model
 from hil.fakes.servo.servo import EmulatedServo
 from hil.toml_errors import Described, describe, meant_name
 from hil.toml_file import TomlFileError, load_toml
@@ -32,12 +33,22 @@ class DescriptionError(ValueError):
     """The [fake] table is unreadable or invalid. The message names the file, the key, the value and what is allowed."""
 
 
+_KEYS_OF_REGISTERS = {"ID": "id", "Baud Rate": "baud", "Return Delay Time": "return_delay_us"}
+"""Keys of a servo that set an EEPROM register, by the register's name."""
+
+
+def _listed(values: Sequence[int]) -> str:
+    return f"{', '.join(map(str, values[:-1]))} or {values[-1]}"
+
+
 class FakeServo(Described):
     """The initial state of one servo on the bus: set up for its arm and powered, with torque off."""
 
     id: Annotated[int, Field(ge=0, le=MAX_ID, description="bus ID")]
     model: Annotated[str, Field(description='name as printed on the servo, e.g. "XM430-W350"')]
-    zero_ticks: Annotated[int, Field(description="Present Position at which the joint's angle is 0")]
+    zero_ticks: Annotated[
+        int, Field(ge=-(1 << 20), le=1 << 20, description="Present Position at which the joint's angle is 0")
+    ]
     direction: Annotated[int, Field(description="-1 if the servo turns in the opposite direction to the joint")] = 1
     joint: Annotated[
         int | None,
@@ -70,7 +81,10 @@ class FakeServo(Described):
         Field(description="conditions for an overload shutdown; by default, the servo never shuts down"),
     ] = None
     registers: Annotated[
-        dict[str, int], Field(description="values of other EEPROM registers that differ from the factory defaults")
+        dict[str, int],
+        Field(
+            description="values of EEPROM registers that no other key sets, if they differ from the factory defaults"
+        ),
     ] = {}  # noqa: RUF012  # pydantic copies it
 
     @field_validator("model")
@@ -101,13 +115,26 @@ class FakeServo(Described):
 
     @model_validator(mode="after")
     def _known_registers(self) -> Self:
-        table = load_model(self.model, self.firmware).registers
+        model = load_model(self.model, self.firmware)
         for name, value in self.registers.items():
-            register = table.get(name)
+            register = model.registers.get(name)
             if register is None or not register.eeprom or not register.writable:
                 raise ValueError(f'registers: "{name}" is not a settable EEPROM register of the {self.model}')
-            if not register.minimum <= value <= register.maximum:
-                raise ValueError(f'registers: "{name}" = {value}: {register.minimum} to {register.maximum} is allowed')
+            if key := _KEYS_OF_REGISTERS.get(name):
+                raise ValueError(f'registers: "{name}" = {value}: not allowed here, because the key {key} sets it')
+            allowed = allowed_values(model, register)
+            if value not in allowed:
+                said = _listed(sorted(allowed)) if isinstance(allowed, frozenset) else f"{allowed[0]} to {allowed[-1]}"
+                raise ValueError(f'registers: "{name}" = {value}: {said} is allowed for the {self.model}')
+        return self
+
+    @model_validator(mode="after")
+    def _baud_of_the_model(self) -> Self:
+        model = load_model(self.model, self.firmware)
+        register = model.registers.get("Baud Rate")
+        if register is not None and BAUD_RATES.index(self.baud) not in allowed_values(model, register):
+            highest = BAUD_RATES[min(register.maximum, len(BAUD_RATES) - 1)]
+            raise ValueError(f"baud = {self.baud}: at most {highest} is allowed for the {self.model}")
         return self
 
 
@@ -276,5 +303,5 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
         seed=fake.seed,
     )
     bus.faults.add(*fake.faults)
-    bus.hand.move(*fake.moves)
+    bus.hand.schedule(*fake.moves)
     return bus

@@ -5,9 +5,10 @@ file's [fake] table. A path without a leading slash is relative to the working d
 is one of the arms bundled with hil (`fake://koch`; see `hil.fakes.names`). `open_fake` does the same from Python
 without a file. pyserial finds this module by its name.
 
-Time is that of `port.clock`: a program that waits must wait on that clock (or in `read`), because wall-clock time does
-not move the arm. In particular, dynamixel-sdk's own port handler, which polls with timeout 0 against `time.time()`,
-receives no replies. With `fake://PATH/TO/ARM.toml?time=real`, the arm runs in real time and works with any program.
+Time is that of `port.clock`: a program must wait on that clock (in `port.wait` or `read`), because wall-clock time
+does not move the arm. In particular, dynamixel-sdk's own port handler, which polls with timeout 0 against
+`time.time()`, receives no replies. With `fake://PATH/TO/ARM.toml?time=real`, the arm runs in real time and works with
+any program.
 
 An unplugged cable (see `hil.fakes.bus.faults`) acts as on Linux: writing and reading raise `serial.SerialException`,
 and `reset_input_buffer` raises `termios.error`. The port must then be closed and reopened once the cable is replugged.
@@ -139,6 +140,17 @@ class FakeSerial(SerialBase):
         """Put bytes on the wire and return immediately, like a buffered driver."""
         self._open_bus().write(bytes(data))
         return len(data)
+
+    def wait(self, seconds: float) -> None:
+        """Let the arm run for this long on `clock`: at once in virtual time. `bus` is then up to date.
+
+        Bytes that arrive meanwhile can still be read. pyserial's own ports have no such method.
+        """
+        if not 0.0 <= seconds < math.inf:
+            raise ValueError(f"cannot wait for {seconds} s")
+        bus = self.bus
+        self.clock.wait_until(self.clock.now() + seconds)
+        bus.advance(self.clock.now())
 
     def flush(self) -> None:
         """Wait on `clock` until everything written has been sent."""

@@ -17,8 +17,8 @@ HilError                    exit code
     └── RecordingCutShort   1
 
 hil.drivers.errors.DriverError  1   communication with the servos
-                                UnknownModel, PortNotOpened, WrongModel and WrongSetting exit with 2,
-                                but with 1 once torque has been switched on
+                                NoControlTables, UnknownModel, PortNotOpened, WrongModel and WrongSetting
+                                exit with 2, but with 1 once torque has been switched on
 hil.estimator.errors.EstimationError  1   the recording does not determine the parameters
 """
 

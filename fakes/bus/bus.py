@@ -79,7 +79,7 @@ class FakeBus:
         self._next_tick = math.inf
         self._index = {servo: index for index, servo in enumerate(self._servos)}
         self._hand = Hand(self._joints, plant, lambda: self.clock.now() - self._origin, self._ticks_wanted)
-        self.faults = Faults(seed, self._begin_fault, self._end_fault)
+        self.faults = Faults(seed, self._begin_fault, self._end_fault, lambda: self.advance(self.clock.now()))
         self._instructions = Instructions(self._servos, self)
         for joint, servo in zip(self._joints.of, self._servos, strict=True):
             servo.power_up(self._now, lambda joint=joint: self.plant.position[joint])  # type: ignore[misc]

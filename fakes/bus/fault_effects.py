@@ -27,7 +27,7 @@ def begin(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], 
             case FaultKind.REBOOT:
                 servo.reboot(now, fault.size)
             case FaultKind.OVERHEATING:
-                servo.temperature_c = servo.memory.get("Temperature Limit", 80) + fault.size
+                servo.heat(servo.memory.get("Temperature Limit", 80) + fault.size)
             case FaultKind.OVERLOAD:
                 servo.fail(HardwareError.OVERLOAD)
             case FaultKind.LOW_VOLTAGE:
@@ -40,13 +40,15 @@ def begin(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], 
 
 
 def end(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], plant: Plant) -> None:
-    """Undo a fault if its effect is temporary. A heated servo stays hot, and an error remains until a reboot."""
+    """Undo a fault if its effect is temporary. A heated servo begins to cool; an error remains until a reboot."""
     for joint, servo in zip(joints, servos, strict=True):
         if not fault.concerns(servo.id):
             continue
         match fault.kind:
             case FaultKind.SILENT_SERVO:
                 servo.connected = True
+            case FaultKind.OVERHEATING:
+                servo.cool()
             case FaultKind.LOW_VOLTAGE:
                 servo.dip(0.0)
             case FaultKind.STUCK_JOINT:
@@ -71,7 +73,8 @@ def put_with_faults(faults: Faults, wire: "Wire", servo_id: int, data: bytes, st
             case FaultKind.LOST_REPLY:
                 copies = 0
             case FaultKind.CORRUPTED_REPLY:
-                data = _flipped(data, [random.randrange(8 * len(data)) for _ in range(round(fault.size))])
+                bits = range(8 * len(data))
+                data = _flipped(data, random.sample(bits, min(round(fault.size), len(bits))))
             case FaultKind.TRUNCATED_REPLY:
                 data = data[: random.randrange(1, len(data))]
             case FaultKind.DUPLICATED_REPLY:

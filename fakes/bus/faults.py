@@ -17,7 +17,7 @@ from enum import StrEnum
 from random import Random
 from typing import Annotated, NamedTuple
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
 from hil.toml_errors import Described, describe
 
@@ -58,20 +58,37 @@ class FaultKind(StrEnum):
 
 
 class FaultFacts(NamedTuple):
-    """The effect of one kind of fault, and the meaning and default of its `amount`."""
+    """The effect of one kind of fault, and the meaning, default and range (inclusive) of its `amount`.
+
+    amount: its unit; "" if the kind has no amount. whole: whether it must be a whole number.
+    """
 
     does: str
     amount: str = ""
     default: float = 0.0
+    least: float = 0.0
+    most: float = 0.0
+    whole: bool = False
+
+    @property
+    def allowed(self) -> str:
+        """The amounts allowed, in words."""
+        number = "a whole number" if self.whole else "a number"
+        return f"{number} from {self.least:.7g} to {self.most:.7g} ({self.amount})"
+
+    def allows(self, amount: float) -> bool:
+        return self.least <= amount <= self.most and (not self.whole or amount == round(amount))
 
 
 FAULTS: Mapping[FaultKind, FaultFacts] = {
     FaultKind.LOST_REPLY: FaultFacts("a status packet never reaches the host"),
-    FaultKind.CORRUPTED_REPLY: FaultFacts("bits of a status packet are flipped", "bits", 1),
+    FaultKind.CORRUPTED_REPLY: FaultFacts("bits of a status packet are flipped", "bits", 1, 1, 88, whole=True),
     FaultKind.TRUNCATED_REPLY: FaultFacts("a status packet ends early"),
     FaultKind.DUPLICATED_REPLY: FaultFacts("a status packet arrives twice"),
-    FaultKind.LATE_REPLY: FaultFacts("the adapter delays a status packet and all bytes after it", "seconds", 0.02),
-    FaultKind.NOISE: FaultFacts("random bytes precede a status packet", "bytes", 8),
+    FaultKind.LATE_REPLY: FaultFacts(
+        "the adapter delays a status packet and all bytes after it", "seconds", 0.02, 1e-6, 3600
+    ),
+    FaultKind.NOISE: FaultFacts("random bytes precede a status packet", "bytes", 8, 1, 1000, whole=True),
     FaultKind.LOST_INSTRUCTION: FaultFacts("an instruction packet is lost on its way to one servo, or to all servos"),
     FaultKind.CORRUPTED_INSTRUCTION: FaultFacts(
         "an instruction packet arrives with a wrong CRC at one servo, or at all servos"
@@ -81,17 +98,31 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
         "Alert",
         "ERR byte",
         1,
+        1,
+        255,
+        whole=True,
     ),
     FaultKind.OTHER_MASTER: FaultFacts(
-        "another program on the bus keeps requesting a servo's position", "seconds between requests", 0.01
+        "another program on the bus keeps requesting a servo's position", "seconds between requests", 0.01, 1e-3, 3600
     ),
     FaultKind.SILENT_SERVO: FaultFacts("a servo's bus cable is disconnected; its motor keeps running"),
-    FaultKind.REBOOT: FaultFacts("a servo reboots after a dip in its supply voltage", "seconds without response", 0.25),
-    FaultKind.OVERHEATING: FaultFacts("a servo is hotter than its Temperature Limit", "kelvin above it", 10),
+    FaultKind.REBOOT: FaultFacts(
+        "a servo reboots after a dip in its supply voltage", "seconds without response", 0.25, 0, 3600
+    ),
+    FaultKind.OVERHEATING: FaultFacts(
+        "a servo is hotter than its Temperature Limit; when the fault ends, it cools by 10 K/s, unless its [thermal] "
+        "table cools it from the start",
+        "kelvin above it",
+        10,
+        1,
+        150,
+    ),
     FaultKind.OVERLOAD: FaultFacts("a servo reports overload"),
-    FaultKind.LOW_VOLTAGE: FaultFacts("the supply falls below a servo's Min Voltage Limit", "volts below it", 1.0),
+    FaultKind.LOW_VOLTAGE: FaultFacts(
+        "the supply falls below a servo's Min Voltage Limit", "volts below it", 1.0, 0.1, 40
+    ),
     FaultKind.STUCK_JOINT: FaultFacts("a joint is jammed"),
-    FaultKind.ENCODER_JUMP: FaultFacts("an encoder's position reading is offset", "ticks", 512),
+    FaultKind.ENCODER_JUMP: FaultFacts("an encoder's position reading is offset", "ticks", 512, -1e6, 1e6, whole=True),
     FaultKind.CABLE_PULLED: FaultFacts(
         "the adapter's cable is unplugged, and replugged when the fault ends; the port must be reopened"
     ),
@@ -109,7 +140,6 @@ REPLY_FAULTS = frozenset(
     }
 )
 INSTRUCTION_FAULTS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTRUCTION})
-_LEAST_REPEAT_S = 1e-3
 
 
 class Fault(Described):
@@ -124,8 +154,16 @@ class Fault(Described):
     ] = 1.0
     amount: Annotated[
         float | None,
-        Field(allow_inf_nan=False, description="size; its meaning and default depend on the kind"),
+        Field(allow_inf_nan=False, description="size; its meaning, default and range depend on the kind"),
     ] = None
+
+    @field_validator("amount")
+    @classmethod
+    def _allowed_amount(cls, amount: float | None, others: ValidationInfo) -> float | None:
+        kind = others.data.get("kind")  # absent if it is wrong itself
+        if kind is not None and (wrong := _wrong_amount(kind, amount)):
+            raise ValueError(wrong)
+        return amount
 
     @property
     def end(self) -> float:
@@ -140,10 +178,18 @@ class Fault(Described):
     @property
     def repeats_every(self) -> float:
         """Period with which the fault recurs [s]; infinite for a fault that happens once."""
-        return max(self.size, _LEAST_REPEAT_S) if self.kind is FaultKind.OTHER_MASTER else math.inf
+        return self.size if self.kind is FaultKind.OTHER_MASTER else math.inf
 
     def concerns(self, servo_id: int) -> bool:
         return self.servo is None or self.servo == servo_id
+
+
+def _wrong_amount(kind: FaultKind, amount: float | None) -> str:
+    """Say what is allowed if a kind of fault cannot have this amount; otherwise return ""."""
+    facts = FAULTS[kind]
+    if amount is None or (facts.amount and facts.allows(amount)):
+        return ""
+    return f"must be {facts.allowed} for {kind}" if facts.amount else f"{kind} has no amount"
 
 
 class Happened(NamedTuple):
@@ -158,9 +204,13 @@ Effect = Callable[[Fault], None]
 
 
 class Faults:
-    """The faults of one bus: pending ones, active ones, and a record of those that took effect (`happened`)."""
+    """The faults of one bus: pending ones, active ones, and a record of those that took effect (`happened`).
 
-    def __init__(self, seed: int, begin: Effect, end: Effect) -> None:
+    begin, end: apply a fault to the servos, and undo it. catch_up: advances the bus to the present, so that what is
+    added or cleared now does not take effect at the time of the last packet.
+    """
+
+    def __init__(self, seed: int, begin: Effect, end: Effect, catch_up: Callable[[], None] = lambda: None) -> None:
         self.happened: list[Happened] = []
         self.next_change = math.inf
         """Time at which the next fault begins or ends [s since the bus was created]."""
@@ -169,6 +219,7 @@ class Faults:
         self.on_instructions: list[Fault] = []
         self.on_answers: list[Fault] = []
         self.random = Random(f"faults {seed}")
+        self._catch_up = catch_up
         self._begin = begin
         self._end = end
         self._to_come: list[Fault] = []
@@ -176,12 +227,20 @@ class Faults:
         self._repeats: list[tuple[float, Fault]] = []
 
     def add(self, *faults: Fault) -> None:
-        """Add faults; those whose start time has passed begin immediately."""
+        """Add faults; those whose start time has passed begin immediately.
+
+        Raises ValueError for an amount that is not allowed, as a copy with other values may have.
+        """
+        for fault in faults:
+            if wrong := _wrong_amount(fault.kind, fault.amount):
+                raise ValueError(f"fault: amount = {fault.amount!r}: {wrong}.")
+        self._catch_up()
         self._to_come.extend(faults)
         self._look_ahead()
 
     def clear(self) -> None:
         """End all active faults and cancel the pending ones."""
+        self._catch_up()
         self._to_come.clear()
         for fault in list(self._lasting):
             self._finish(fault)
@@ -213,7 +272,7 @@ class Faults:
         """
         for fault in self.on_answers:
             if self.strikes(fault, servo_id, now):
-                return round(fault.size) & 0xFF
+                return round(fault.size)
         return 0
 
     def strikes(self, fault: Fault, servo_id: int | None, now: float) -> bool:

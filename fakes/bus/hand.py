@@ -30,6 +30,13 @@ _PULL_S = 0.01
 """Time constant with which the hand corrects the joint's deviation from the planned path [s]."""
 
 
+_FASTEST_RAD_S = 200.0
+"""Greatest mean velocity of a movement [rad/s]; simulated gears and stops do not survive much more."""
+
+_MOST_TICKS = 1 << 20
+"""Largest Present Position of a servo in either direction: 256 turns."""
+
+
 class Move(Described):
     """One movement of the hand, after which it holds the joint for `hold` seconds; by default, indefinitely."""
 
@@ -38,11 +45,20 @@ class Move(Described):
         float | None,
         Field(ge=-4 * PI, le=4 * PI, allow_inf_nan=False, description="joint angle at the end [rad]"),
     ] = None
-    ticks: Annotated[int | None, Field(description="Present Position at the end, instead of `to`")] = None
+    ticks: Annotated[
+        int | None,
+        Field(ge=-_MOST_TICKS, le=_MOST_TICKS, description="Present Position at the end, instead of `to` [ticks]"),
+    ] = None
     at: Annotated[float, Field(ge=0, le=86400, allow_inf_nan=False, description="delay before the start [s]")] = 0.0
-    duration: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False, description="duration of the movement [s]")] = (
-        1.0
-    )
+    duration: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=600,
+            allow_inf_nan=False,
+            description="duration of the movement [s]; longer above 200 rad/s on average",
+        ),
+    ] = 1.0
     hold: Annotated[float, Field(ge=0, description="how long the joint is held afterwards [s]")] = math.inf
 
     @model_validator(mode="after")
@@ -99,8 +115,19 @@ class Hand:
     def move(self, *moves: Move) -> None:
         """Schedule moves, each `at` seconds from now.
 
-        Raises PlantError if the plant's joints cannot be held, ValueError for an ID that no servo has.
+        Raises PlantError if the plant's joints cannot be held, ValueError for an ID that no servo has, and for a move
+        that starts now while its joint's torque is on. One that starts later is skipped if torque is on by then.
         """
+        for move in moves:
+            if move.at == 0.0 and (driving := self._driving(self._joint_of(move))):
+                raise ValueError(
+                    f"the torque of servo {driving[0]} is on, and the hand moves only joints whose torque is off: "
+                    "write 0 to its Torque Enable first"
+                )
+        self.schedule(*moves)
+
+    def schedule(self, *moves: Move) -> None:
+        """Schedule moves as `move` does; one whose joint's torque is on when it should start is skipped."""
         now = self._time()
         free = {self._joint_of(move) for move in moves} - self._grips.keys()
         if moves and not isinstance(self._plant, CanBeHeld):
@@ -129,7 +156,7 @@ class Hand:
         while self._to_come and self._to_come[0].at <= now:
             self._take(self._to_come.pop(0), now)
         for grip in list(self._grips.values()):
-            if now >= grip.until or self._driven(grip.joint):
+            if now >= grip.until or self._driving(grip.joint):
                 self._let_go(grip.joint)
                 continue
             share = min((now - grip.began) / grip.duration, 1.0)
@@ -143,17 +170,19 @@ class Hand:
 
     def _take(self, move: Move, now: float) -> None:
         joint = self._joint_of(move)
-        if self._driven(joint):
+        if self._driving(joint):
             return
         start = self._plant.position[joint]
         end = move.to
         if end is None:
             servo = next(servo for servo in self._joints.of_joint(joint) if servo.id == move.servo)
             end = servo.present.angle(move.ticks or 0)
-        self._grips[joint] = _Grip(joint, start, end, now, move.duration, now + move.duration + move.hold)
+        duration = max(move.duration, abs(end - start) / _FASTEST_RAD_S)
+        self._grips[joint] = _Grip(joint, start, end, now, duration, now + duration + move.hold)
 
-    def _driven(self, joint: int) -> bool:
-        return any(servo.torque_enabled for servo in self._joints.of_joint(joint))
+    def _driving(self, joint: int) -> list[int]:
+        """Return the IDs of the joint's servos whose torque is on."""
+        return [servo.id for servo in self._joints.of_joint(joint) if servo.torque_enabled]
 
     def _let_go(self, joint: int) -> None:
         del self._grips[joint]

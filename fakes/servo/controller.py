@@ -124,7 +124,7 @@ class Controller:
         if goals is None:
             return 0.0
         back = model.back_emf_v_s * velocity
-        limit = goals.pwm_limit if goals.mode == PWM_MODE else min(goals.pwm_limit, abs(goals.pwm))
+        limit = min(goals.pwm_limit, abs(goals.pwm))
         if goals.mode == CURRENT_MODE:
             wanted = goals.current * model.current_unit_a
         elif goals.mode == CURRENT_POSITION_MODE:

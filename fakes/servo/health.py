@@ -36,22 +36,62 @@ class Overload(Described):
     ]
 
 
+COOLING_K_S = 10.0
+"""Rate at which a servo without [thermal] table cools after a fault has heated it [K/s].
+
+*Chosen*, so that a test need not wait long: a real servo takes minutes.
+"""
+
+
 class Health:
     """Temperature and overload state of one servo."""
 
     def __init__(
         self, resistance_ohm: float, temperature_c: float, thermal: Thermal | None, overload: Overload | None
     ) -> None:
-        self.temperature_c = temperature_c
+        self._temperature_c = temperature_c
+        self._unheated_c = temperature_c
+        self._heated_by = 0
+        """Number of faults that currently heat the servo."""
         self._resistance_ohm = resistance_ohm
         self._thermal = thermal
         self._overload = overload
         self._overloaded_s = 0.0
 
     @property
+    def temperature_c(self) -> float:
+        return self._temperature_c
+
+    @temperature_c.setter
+    def temperature_c(self, celsius: float) -> None:
+        self._temperature_c = self._unheated_c = celsius
+
+    @property
     def changes(self) -> bool:
         """Whether the state changes with time."""
-        return self._thermal is not None or self._overload is not None
+        return self._thermal is not None or self._overload is not None or self._cools
+
+    @property
+    def _cools(self) -> bool:
+        return not self._heated_by and self._temperature_c != self._unheated_c
+
+    def heat(self, celsius: float) -> None:
+        """Begin a fault that heats the servo to this temperature [C].
+
+        With a thermal model, the servo then cools by itself; without one, it stays hot until `cool` is called.
+        """
+        if self._thermal is not None:
+            self.temperature_c = celsius
+        else:
+            self._temperature_c = celsius
+            self._heated_by += 1
+
+    def cool(self) -> None:
+        """End a fault that heats the servo.
+
+        Without a thermal model, its temperature returns at the rate `COOLING_K_S` to what it was before the fault.
+        """
+        self._heated_by = max(0, self._heated_by - 1)
 
     def step(self, step_s: float, current_a: float) -> bool:
         """Advance by `step_s` [s] with this motor current [A]; return whether the servo is then overloaded."""
@@ -59,6 +99,8 @@ class Health:
         if thermal is not None:
             end = thermal.ambient_c + thermal.resistance_k_w * self._resistance_ohm * current_a**2
             self.temperature_c += (end - self.temperature_c) * min(step_s / thermal.time_s, 1.0)
+        elif self._cools:
+            self._temperature_c = max(self._unheated_c, self._temperature_c - COOLING_K_S * step_s)
         overload = self._overload
         if overload is None:
             return False

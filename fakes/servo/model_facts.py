@@ -253,6 +253,38 @@ FACTS: Mapping[str, ModelFacts] = {
 }
 """All X-series models with a single 5 to 12 V motor and a model number in the SDK."""
 
+COMMON_INITIAL: Mapping[str, int] = {
+    "ID": 1,
+    "Baud Rate": 1,
+    "Secondary(Shadow) ID": 255,
+    "Secondary ID": 255,
+    "Status Return Level": 2,
+}
+"""Factory values of every Protocol 2.0 servo whose ranges are unknown here."""
+
+_X_INITIAL = {
+    "Return Delay Time": 250,
+    "Operating Mode": 3,
+    "Protocol Type": 2,
+    "Moving Threshold": 10,
+    "PWM Limit": 885,
+    "Max Position Limit": 4095,
+    "Shutdown": 52,
+}
+
+X_INITIAL: Mapping[str, Mapping[str, int]] = {
+    "2XL430-W250": _X_INITIAL
+    | {"Temperature Limit": 72, "Max Voltage Limit": 140, "Min Voltage Limit": 60, "Velocity Limit": 250},
+    "2XC430-W250": _X_INITIAL
+    | {"Temperature Limit": 80, "Max Voltage Limit": 160, "Min Voltage Limit": 60, "Velocity Limit": 275},
+    "XH430-V210": _X_INITIAL,
+    "XH430-V350": _X_INITIAL,
+    "XH540-V150": _X_INITIAL,
+    "XH540-V270": _X_INITIAL,
+    "XW540-H260": _X_INITIAL,
+}
+"""Factory values in the EEPROM of X models whose ranges are unknown here; of the 24 V models, only what all share."""
+
 _STRENGTH = (0, 1023)
 
 OTHER_SERIES: Mapping[str, Mapping[str, RegisterFacts]] = {

@@ -67,6 +67,17 @@ class Powered(ABC):
         self._check_health()
         self._derive()
 
+    def heat(self, celsius: float) -> None:
+        """Begin a fault that heats the servo to this temperature [C]."""
+        self.health.heat(celsius)
+        self._check_health()
+        self._derive()
+
+    def cool(self) -> None:
+        """End a fault that heats the servo; see `Health.cool`."""
+        self.health.cool()
+        self._derive()
+
     def _check_health(self) -> None:
         """Compare supply and temperature with their limits; violations remain set in Hardware Error Status."""
         memory = self.memory

@@ -14,10 +14,12 @@ from functools import cache
 
 from hil.drivers.control_table import load_control_table, model_names
 from hil.fakes.servo.model_facts import (
+    COMMON_INITIAL,
     FACTS,
     NEVER,
     OTHER_SERIES,
     REVERSES_ALL,
+    X_INITIAL,
     X_SERIES,
     Blocks,
     ModelFacts,
@@ -70,6 +72,13 @@ class EmulatedModel:
     reverses_all: bool
     """Whether Reverse Mode inverts velocity, current and PWM as well as position."""
     registers: Mapping[str, Register]
+
+
+def allowed_values(model: EmulatedModel, register: Register) -> range | frozenset[int]:
+    """Return the values that a servo of this model accepts in this register."""
+    if register.name == "Operating Mode" and model.operating_modes:
+        return model.operating_modes
+    return range(register.minimum, register.maximum + 1)
 
 
 MODEL_NAMES = tuple(FACTS)
@@ -150,13 +159,14 @@ def _unknown(name: str) -> EmulatedModel:
     ram = torque.address if torque is not None else 64
     taken: set[int] = set()
     registers = {}
+    initial = {**COMMON_INITIAL, **X_INITIAL.get(name, {})}
     for entry in addresses.registers.values():
         span = set(range(entry.address, entry.address + entry.size))
         if span & taken:
             continue  # the SDK's second name for the same bytes
         taken |= span
         facts = OTHER_SERIES.get(name, {}).get(entry.name) or RegisterFacts(
-            initial={"ID": 1, "Baud Rate": 1, "Status Return Level": 2}.get(entry.name, 0),
+            initial=initial.get(entry.name, 0),
             limits=(0, 252) if entry.name == "ID" else None,
             writable=not entry.name.startswith(_NOT_WRITABLE),
         )

@@ -205,7 +205,8 @@ class EmulatedServo(Powered):
         if self.health.changes:
             if self.health.step(step_s, current) and not self.hardware_error & HardwareError.OVERLOAD:
                 self.fail(HardwareError.OVERLOAD)
-            if round(self.health.temperature_c) != self.memory.get("Present Temperature"):
+            differs = round(self.health.temperature_c) != self.memory.get("Present Temperature")
+            if differs or not self.health.changes:  # a servo that has cooled down needs no more ticks
                 self._check_health()
                 self._derive()
         if not self._torque:

@@ -3,7 +3,7 @@
 from hil.drivers.packet import StatusError
 from hil.fakes.servo.controller import POSITION_MODE
 from hil.fakes.servo.memory import Memory
-from hil.fakes.servo.registers import TICKS_PER_TURN, EmulatedModel, Register
+from hil.fakes.servo.registers import TICKS_PER_TURN, EmulatedModel, Register, allowed_values
 
 GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
 
@@ -34,10 +34,8 @@ def refusal(memory: Memory, model: EmulatedModel, register: Register, value: int
     name = register.name
     if not register.writable or (register.eeprom and (shadow or memory.get("Torque Enable"))):
         return StatusError.ACCESS
-    in_range = register.minimum <= value <= register.maximum
+    in_range = value in allowed_values(model, register)
     known = bool(model.operating_modes)
-    if name == "Operating Mode" and known:
-        in_range = value in model.operating_modes
     watchdog_tripped = memory.get("Bus Watchdog") == WATCHDOG_TRIPPED
     if watchdog_tripped and (name in GOALS or (name == "Bus Watchdog" and value != 0)):
         in_range = False

@@ -29,7 +29,10 @@ def exit_code(error: Exception) -> int | None:
     if isinstance(error, HilError):
         return error.exit_code
     if isinstance(error, driver.DriverError):
-        of_the_input = driver.UnknownModel | driver.PortNotOpened | driver.WrongModel | driver.WrongSetting
+        of_the_input = (
+            *(driver.NoControlTables, driver.UnknownModel, driver.PortNotOpened),
+            *(driver.WrongModel, driver.WrongSetting),
+        )
         return 2 if isinstance(error, of_the_input) and not error.after_torque else 1
     if isinstance(error, PlantError):
         return 2

@@ -42,20 +42,22 @@ def describe_fake(config: Path, faults: list[str], moves: list[str], seed: int |
 
 def list_faults() -> None:
     for kind, facts in FAULTS.items():
-        amount = f"; amount: {facts.amount}, default {facts.default:g}" if facts.amount else ""
+        amount = f"; amount: {facts.allowed}, default {facts.default:g}" if facts.amount else ""
         print(f"{kind:22s} {facts.does}{amount}")
 
 
 def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
-    """Move or release joints of the fake arm served at `device`. They move only while their torque is off. Raises
-    ConfigError.
+    """Move or release joints of the fake arm served at `device`: all of them, or none if one cannot be moved.
+
+    Raises ConfigError, for example if the torque of one of them is on.
     """
     try:
         for servo in release:
             ask_hand(device, f"release {servo}")
         for text in moves:
             parse_move(text)
-            ask_hand(device, f"move {text}")
+        if moves:
+            ask_hand(device, f"move {' '.join(moves)}")
     except (NoHand, ValueError) as error:
         raise ConfigError(str(error)) from error
 

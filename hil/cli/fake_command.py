@@ -66,7 +66,10 @@ def hand(
     ] = None,
     release: Annotated[list[int] | None, typer.Option(metavar="ID", help="Release this servo's joint.")] = None,
 ) -> None:
-    """Move joints of a fake arm while their torque is off, as a person does when calibrating an arm by hand."""
+    """Move joints of a fake arm while their torque is off, as a person does when calibrating an arm by hand.
+
+    If the torque of one of them is on, nothing moves, and the exit code is 2.
+    """
     from hil.cli import fake as work
 
     work.move_by_hand(device, moves or [], release or [])

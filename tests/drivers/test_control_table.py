@@ -1,11 +1,16 @@
 """Control tables read from the SDK's own files."""
 
 import itertools
+from importlib.machinery import ModuleSpec
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
 
 import pytest
 
+from hil.cli.errors import exit_code
+from hil.drivers import control_table
 from hil.drivers.control_table import load_control_table, model_names
-from hil.drivers.errors import UnknownModel
+from hil.drivers.errors import NoControlTables, UnknownModel
 from hil.drivers.servo_model import SERVO_MODELS, Mode, servo_model
 from hil.drivers.state import read_back_spans, spans
 from hil.drivers.sync_read import one_each
@@ -41,6 +46,31 @@ def test_unsigned_registers_do_not_go_negative() -> None:
 def test_unknown_model_lists_the_known_ones() -> None:
     with pytest.raises(UnknownModel, match=r"XM430-W351.*Known: .*XM430-W350"):
         load_control_table("XM430-W351")
+
+
+@pytest.mark.parametrize(
+    ("installed", "said"),
+    [
+        ("3.8.4", r"version 4\.1 or newer, but 3\.8\.4 is installed, probably because another package needs an older"),
+        (None, r"version 4\.1 or newer, which is not installed"),
+    ],
+)
+@pytest.mark.parametrize("without", ["package", "tables"])
+def test_an_sdk_without_control_tables_is_an_error_of_the_installation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, installed: str | None, said: str, without: str
+) -> None:
+    def installed_version(package: str) -> str:
+        if installed is None:
+            raise PackageNotFoundError(package)
+        return installed
+
+    empty = ModuleSpec("dynamixel_easy_sdk", None, origin=str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(control_table, "find_spec", lambda _: None if without == "package" else empty)
+    monkeypatch.setattr(control_table, "version", installed_version)
+    model_names.cache_clear()
+    with pytest.raises(NoControlTables, match=said) as caught:
+        model_names()
+    assert exit_code(caught.value) == 2
 
 
 def test_an_unknown_servo_model_lists_what_is_possible() -> None:

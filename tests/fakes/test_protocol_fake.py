@@ -1,7 +1,9 @@
 """fake:// as a pyserial port, and dynamixel-sdk working through it."""
 
+import math
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from hil.drivers.packet import encode, encode_status
 from hil.drivers.port import open_port
 from hil.drivers.sdk_port import SdkPort
 from hil.fakes.bus.clock import VirtualClock
+from hil.fakes.bus.hand import Move
 from hil.fakes.description import load_fake
 from hil.fakes.protocol_fake import FakeSerial, open_fake
 from tests.support.paths import CONFIGS
@@ -51,6 +54,25 @@ def test_ask_and_answer(port: FakeSerial) -> None:
     assert port.read(len(PONG)) == PONG
     assert port.clock.now() == pytest.approx(240e-6 + 60e-6)
     assert port.bus.servos[1].model.name == "XM430-W350"
+
+
+def test_waiting_lets_the_arm_run_in_virtual_time(port: FakeSerial, monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = port.bus
+    bus.hand.move(Move(servo=2, to=0.5, duration=1.0))
+    began, real = port.clock.now(), time.monotonic()
+    monkeypatch.setattr("time.sleep", port.wait)
+    time.sleep(0.5)
+    assert 0.1 < bus.plant.position[1] < 0.4
+    port.wait(4.5)
+    assert bus.plant.position[1] == pytest.approx(0.5, abs=0.02)
+    assert port.clock.now() == pytest.approx(began + 5.0)
+    assert time.monotonic() - real < 5.0
+    port.write(PING)
+    port.wait(0.1)
+    assert port.read(len(PONG)) == PONG, "what arrived meanwhile is not lost"
+    for seconds in (-1.0, math.inf, math.nan):
+        with pytest.raises(ValueError, match="cannot wait for"):
+            port.wait(seconds)
 
 
 def test_read_waits_for_the_timeout_only(port: FakeSerial) -> None:

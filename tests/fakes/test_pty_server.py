@@ -290,6 +290,16 @@ def test_a_hand_that_cannot_says_why(
     assert said in capsys.readouterr().err
 
 
+def test_a_hand_says_that_torque_is_on(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
+    server = serve()
+    with server.lock:
+        server.bus.servos[2].write(64, b"\1")
+    assert hil("hand", server.path, "1:to=-1.2", "2:ticks=1000") == 2
+    assert "the torque of servo 2 is on" in capsys.readouterr().err
+    with server.lock:
+        assert not server.bus.hand.busy
+
+
 def test_a_hand_needs_an_arm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert hil("hand", tmp_path / "arm", "1:to=0") == 2
     assert "hil fake ARM --pty" in capsys.readouterr().err

@@ -47,6 +47,9 @@ RUN_ELSEWHERE = {
     "pip": "test_packaging installs into a clean environment",
     "python3": "test_packaging makes a clean environment",
     ".venv/bin/python": "test_packaging, CI",
+    ".venv-hil/bin/pip": "like pip, for programs that need another dynamixel-sdk",
+    "export": "tests/fakes/test_ci_page.py sets HIL",
+    "pytest": "tests/fakes/test_ci_page.py",
     "mkdocs": "test_the_site_builds",
 }
 """Commands that these tests do not run unchanged, with the reason or the test that runs them."""

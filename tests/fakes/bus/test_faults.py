@@ -1,6 +1,7 @@
 """Every fault happens at its time, to its servo, with its probability, and reproducibly for the same seed."""
 
 import termios
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -219,6 +220,53 @@ def test_hardware_errors(bench: Any, kind: str, error: HardwareError, shuts_down
     assert bench.servo(2).value("Present Input Voltage") == 120
 
 
+@pytest.mark.parametrize("how", ["duration", "clear"])
+def test_an_overheated_servo_recovers_after_cooling(bench: Any, how: str) -> None:
+    bench.arm(1, goal_ticks=100)
+    fault = Fault(kind="overheating", servo=1, at=0.5, **({"duration": 20.0} if how == "duration" else {}))
+    bench.bus.faults.add(fault)
+    bench.clock.wait_until(20.49)
+    assert bench.servo().value("Present Temperature") == 90, "it stays hot as long as the fault lasts"
+    bench.clock.wait_until(20.5)
+    if how == "clear":
+        bench.bus.faults.clear()
+    assert bench.servo().temperature_c == pytest.approx(90, abs=0.2)
+    bench.ask(1, Instruction.REBOOT)
+    bench.wait(BOOT_S)
+    assert bench.servo().hardware_error == HardwareError.OVERHEATING, "it is still too hot"
+    bench.clock.wait_until(22.5)
+    assert bench.servo().temperature_c == pytest.approx(70, abs=0.2)
+    bench.ask(1, Instruction.REBOOT)
+    bench.wait(BOOT_S)
+    assert bench.servo().hardware_error == 0
+    bench.arm(1, goal_ticks=100)
+    bench.wait(3600.0)
+    assert bench.servo().value("Present Temperature") == 35
+    assert bench.servo().torque_enabled
+    assert not bench.servo().needs_ticks, "it costs nothing any more"
+
+
+def test_a_servo_that_two_faults_heat_cools_after_both(bench: Any) -> None:
+    bench.bus.faults.add(
+        Fault(kind="overheating", servo=1, at=1.0, duration=2.0), Fault(kind="overheating", at=2.0, duration=5.0)
+    )
+    for second, temperature in ((0.9, 35), (2.9, 90), (6.9, 90), (8.0, 80), (20.0, 35)):
+        bench.clock.wait_until(second)
+        assert bench.servo().value("Present Temperature") == temperature
+
+
+def test_what_is_cleared_or_added_now_takes_effect_now(bench: Any) -> None:
+    """Not at the time of the last packet, up to which the bus has been computed."""
+    bench.bus.faults.add(Fault(kind="overheating"))
+    bench.wait(10.0)
+    bench.bus.faults.clear()
+    assert bench.servo().value("Present Temperature") == 90
+    bench.wait(10.0)
+    bench.bus.faults.add(Fault(kind="reboot"))
+    bench.wait(0.9 * BOOT_S)
+    assert raw_replies(bench) == [b""]
+
+
 def test_encoder_jump_and_back(bench: Any) -> None:
     bench.bus.faults.add(Fault(kind="encoder_jump", servo=1, at=1.0, duration=1.0, amount=-300))
     assert bench.read(1, 132, 4, signed=True) == 0
@@ -351,6 +399,60 @@ def test_wrong_on_the_command_line(text: str, said: str) -> None:
     with pytest.raises(ValueError, match="fault") as caught:
         parse_fault(text)
     assert said in str(caught.value)
+
+
+WRONG_AMOUNTS = [
+    ("noise", -5, "a whole number from 1 to 1000 (bytes)"),
+    ("noise", 1e9, "a whole number from 1 to 1000 (bytes)"),
+    ("encoder_jump", 1e12, "a whole number from -1000000 to 1000000 (ticks)"),
+    ("status_error", 300, "a whole number from 1 to 255 (ERR byte)"),
+    ("status_error", -1, "a whole number from 1 to 255"),
+    ("status_error", 1.5, "a whole number from 1 to 255"),
+    ("corrupted_reply", 0, "a whole number from 1 to 88 (bits)"),
+    ("reboot", -1, "a number from 0 to 3600 (seconds without response)"),
+    ("late_reply", -1, "a number from 1e-06 to 3600 (seconds)"),
+    ("other_master", 0, "a number from 0.001 to 3600"),
+    ("low_voltage", -1, "a number from 0.1 to 40 (volts below it)"),
+    ("overheating", -1, "a number from 1 to 150 (kelvin above it)"),
+    ("lost_reply", 1, "lost_reply has no amount"),
+]
+
+
+@pytest.mark.parametrize(("kind", "amount", "said"), WRONG_AMOUNTS)
+def test_a_wrong_amount_is_refused_wherever_it_comes_from(
+    bench: Any, tmp_path: Path, kind: str, amount: float, said: str
+) -> None:
+    given = f"amount = {float(amount)!r}: "
+    fault = Fault(kind=kind)
+    attempts: dict[str, Callable[[], object]] = {
+        "the command line": lambda: parse_fault(f"{kind}:amount={amount}"),
+        "TOML": lambda: load_fake(with_fault(tmp_path, f'kind = "{kind}"\namount = {float(amount)}')),
+        "Python": lambda: Fault(kind=kind, amount=float(amount)),
+        "while running": lambda: bench.bus.faults.add(fault.model_copy(update={"amount": float(amount)})),
+    }
+    for source, attempt in attempts.items():
+        with pytest.raises(ValueError, match="amount = ") as caught:
+            attempt()
+        assert given in str(caught.value), source
+        assert said in str(caught.value), source
+
+
+@pytest.mark.parametrize("kind", [kind for kind, facts in FAULTS.items() if facts.amount])
+@pytest.mark.parametrize("end", ["least", "most"])
+def test_every_allowed_amount_works(kind: FaultKind, end: str) -> None:
+    port = open_fake(load_fake(CONFIG))
+    port.bus.faults.add(Fault(kind=kind, amount=getattr(FAULTS[kind], end)))
+    for _ in range(3):
+        port.write(PING)
+        port.read(14)
+    port.write(encode(1, Instruction.READ, b"\x78\0\x1c\0"))
+    port.read(39)
+    assert FAULTS[kind].allows(FAULTS[kind].default)
+
+
+def test_flipping_many_bits_of_a_short_reply(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="truncated_reply"), Fault(kind="corrupted_reply", amount=88))
+    assert all(1 <= len(raw) < len(PONG) for raw in raw_replies(bench, 20))
 
 
 def with_fault(tmp_path: Path, fault: str) -> Path:

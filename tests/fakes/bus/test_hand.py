@@ -75,6 +75,15 @@ def test_a_move_can_end_at_ticks_and_be_released(make_bench: Callable[..., Any])
     assert not bench.bus.hand.busy
 
 
+@pytest.mark.parametrize("end", [{"ticks": 1 << 20}, {"to": -12.5}])
+def test_a_hand_that_is_told_to_be_quick_is_as_fast_as_it_can_be(end: dict[str, Any]) -> None:
+    bench = on_bench(described(DRIVE, 1))
+    bench.bus.hand.move(Move(servo=1, duration=1e-9, **end))
+    bench.wait(10.0)
+    expected = end.get("ticks", 2048 - 12.5 * 4096 / math.tau)
+    assert bench.read(1, 132, 4, signed=True) == pytest.approx(expected, abs=4)
+
+
 def test_ticks_are_those_of_present_position_whatever_shifts_it() -> None:
     description = described(DRIVE, 1)
     servo = description.servos[0].model_copy(
@@ -100,6 +109,18 @@ def test_the_hand_lets_go_when_torque_comes_on() -> None:
     assert bench.write(1, 116, 2300, 4) == 0
     bench.wait(1.0)
     assert bench.read(1, 132, 4, signed=True) > 2150  # free to follow its goal
+
+
+def test_the_hand_refuses_to_move_a_joint_whose_torque_is_on() -> None:
+    bench = on_bench(described(DRIVE))
+    assert bench.write(2, 64, 1) == 0
+    with pytest.raises(ValueError, match="the torque of servo 2 is on"):
+        bench.bus.hand.move(Move(servo=1, to=0.0), Move(servo=2, to=0.0))
+    assert not bench.bus.hand.busy, "neither of the two moves"
+    bench.bus.hand.move(Move(servo=2, to=0.5, at=1.0))
+    assert bench.write(2, 64, 0) == 0
+    bench.wait(3.0)
+    assert bench.read(2, 132, 4, signed=True) == pytest.approx(2048 + 326, abs=12)
 
 
 def test_release_forgets_what_was_to_come() -> None:

@@ -9,6 +9,7 @@ import pytest
 from hil.drivers.packet import HardwareError
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
+from hil.fakes.bus.faults import Fault
 from hil.fakes.bus.supply import Supply
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import load_model
@@ -34,6 +35,15 @@ def test_motor_current_warms_the_servo_until_it_shuts_down(make_bench: Make) -> 
     hot = bench.servo().temperature_c
     bench.wait(20.0)
     assert bench.servo().temperature_c == pytest.approx(25 + (hot - 25) * 2.718281828**-1, abs=5.0)
+
+
+def test_a_servo_with_a_thermal_model_cools_by_it_after_a_fault(make_bench: Make) -> None:
+    bench = make_bench({"thermal": THERMAL, "temperature_c": 25.0})
+    bench.bus.faults.add(Fault(kind="overheating", duration=1.0))
+    bench.wait(20.0)
+    assert bench.servo().temperature_c == pytest.approx(25 + 65 * 2.718281828**-1, abs=0.5)
+    bench.wait(200.0)
+    assert bench.servo().temperature_c == pytest.approx(25, abs=0.1)
 
 
 def test_a_current_held_too_long_is_an_overload(make_bench: Make) -> None:

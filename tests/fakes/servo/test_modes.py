@@ -307,6 +307,27 @@ def test_current_mode_is_limited_by_the_supply_if_asked() -> None:
     assert shaft.velocity[0] < 12.0 / servo.model.back_emf_v_s
 
 
+@pytest.mark.parametrize("mode", [0, 1, 3, 4, 5])
+@pytest.mark.parametrize("limit", ["PWM Limit", "Goal PWM"])
+def test_pwm_limit_and_goal_pwm_limit_every_mode(mode: int, limit: str) -> None:
+    model = load_model("XM430-W350")
+    servo = EmulatedServo(model, 1, zero_ticks=100, registers={"Operating Mode": mode}, voltage_limited=True)
+    shaft = Shaft()
+    clock = VirtualClock()
+    bus = FakeBus([servo], shaft, clock)
+    servo.write(model.registers[limit].address, (100).to_bytes(2, "little"))
+    servo.write(64, b"\1")
+    goal = {0: (102, 2, 300), 1: (104, 4, 200)}.get(mode, (116, 4, 3900))
+    servo.write(goal[0], goal[2].to_bytes(goal[1], "little"))
+    fastest = 0.0
+    for step in range(1, 1500):
+        clock.wait_until(1e-3 * step)
+        bus.advance(clock.now())
+        fastest = max(fastest, shaft.velocity[0])
+    no_load = 100 / 885 * 12.0 / model.back_emf_v_s
+    assert 0.5 * no_load < fastest < 1.02 * no_load
+
+
 def test_where_the_supply_limits_the_current_each_new_goal_counts() -> None:
     servo = EmulatedServo(load_model("XM430-W350"), 1, registers={"Operating Mode": 0}, voltage_limited=True)
     servo.write(64, b"\1")

@@ -4,7 +4,8 @@ from itertools import pairwise
 
 import pytest
 
-from hil.fakes.servo.registers import MODEL_NAMES, load_model
+from hil.fakes.servo.registers import MODEL_NAMES, all_model_names, load_model
+from hil.fakes.servo.servo import EmulatedServo
 
 
 @pytest.mark.parametrize("name", MODEL_NAMES)
@@ -74,6 +75,23 @@ def test_xl430_has_no_current() -> None:
     model = load_model("XL430-W250")
     assert "Goal Current" not in model.registers
     assert 0 not in model.operating_modes
+
+
+@pytest.mark.parametrize("name", [name for name in all_model_names() if name not in MODEL_NAMES and name != "XL320"])
+def test_no_model_obeys_another_id_from_the_factory(name: str) -> None:
+    servo = EmulatedServo(load_model(name), 5)
+    assert servo.shadow_id is None
+    (shadow,) = [each for each in servo.memory.registers if each.startswith("Secondary")]
+    assert servo.value(shadow) == 255
+
+
+@pytest.mark.parametrize(("name", "limits"), [("2XL430-W250", (72, 140, 60, 250)), ("2XC430-W250", (80, 160, 60, 275))])
+def test_factory_values_of_the_double_servos(name: str, limits: tuple[int, ...]) -> None:
+    registers = load_model(name).registers
+    kinds = ("Temperature Limit", "Max Voltage Limit", "Min Voltage Limit", "Velocity Limit")
+    assert tuple(registers[kind].initial for kind in kinds) == limits
+    common = ("Operating Mode", "Protocol Type", "Moving Threshold", "PWM Limit", "Max Position Limit", "Shutdown")
+    assert tuple(registers[kind].initial for kind in common) == (3, 2, 10, 885, 4095, 52)
 
 
 def test_unknown_model() -> None:
