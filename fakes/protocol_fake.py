@@ -173,6 +173,19 @@ class FakeSerial(SerialBase):
         """Check that the port is open, and do nothing else: all data written are already being sent."""
         self._open_bus()
 
+    def cancel_read(self) -> None:
+        """Do nothing: `read` does not block in virtual time, and in real time it ends at its timeout."""
+
+    def cancel_write(self) -> None:
+        """Do nothing: `write` never blocks."""
+
+    @property
+    def cts(self) -> bool:
+        """False: the adapter's modem lines are not connected."""
+        return False
+
+    dsr = ri = cd = cts
+
     def _open_bus(self) -> FakeBus:
         bus = self._bus
         if not self.is_open or bus is None:

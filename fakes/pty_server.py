@@ -38,6 +38,12 @@ time beyond it.
 LONGEST_SLEEP_S = 0.05
 """Longest wait before the server checks for faults, watchdog trips and a request to stop [s]."""
 
+MOST_AHEAD_S = 0.02
+"""Wire time of bytes that the server takes from the terminal before they are due [s].
+
+Beyond it, they wait in the terminal, and a host that goes on writing blocks when that is full, as with a real adapter.
+"""
+
 PRIORITY = 10
 """Priority under SCHED_FIFO, if permitted: below that of a control loop on the same computer."""
 
@@ -132,7 +138,10 @@ class PtyServer:
             due = self.bus.next_reply_by
             wait = min(due - now(), LONGEST_SLEEP_S)
             readable: list[int | HandSocket] = [self._wake_read]
-            if self._master >= 0:
+            wire_is_free_in = self.bus.sent_by - MOST_AHEAD_S - now()
+            if wire_is_free_in > 0.0:
+                wait = min(wait, wire_is_free_in)
+            elif self._master >= 0:
                 readable.append(self._master)
             if self._hand is not None:
                 readable.append(self._hand)

@@ -75,6 +75,14 @@ def test_waiting_lets_the_arm_run_in_virtual_time(port: FakeSerial, monkeypatch:
             port.wait(seconds)
 
 
+def test_the_rest_of_pyserials_interface(port: FakeSerial) -> None:
+    assert [port.cts, port.dsr, port.ri, port.cd] == [False] * 4
+    port.write(PING)
+    port.cancel_read()
+    port.cancel_write()
+    assert port.read(len(PONG)) == PONG
+
+
 def test_read_waits_for_the_timeout_only(port: FakeSerial) -> None:
     assert port.read(1) == b""
     assert port.clock.now() == pytest.approx(0.1)

@@ -1,5 +1,6 @@
 """The fake arm on a terminal: baud rate, link, cable, clocks; `hil fake` and its error messages."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -66,6 +67,26 @@ def test_a_real_terminal_answers(serve: Serve) -> None:
         port.write(PING)
         assert port.read(14) == PONG
     assert server.counts.packets == 52
+
+
+@pytest.mark.parametrize("junk", [b"\xff" * 4096, encode(1, Instruction.READ, b"\x84\0\4\0") * 200])
+def test_a_host_cannot_write_faster_than_the_wire(serve: Serve, junk: bytes) -> None:
+    server = serve()
+    with opened(server.path) as port:
+        port.write_timeout = 0.1
+        written, began = 0, time.monotonic()
+        while time.monotonic() - began < 0.5:
+            with contextlib.suppress(serial.SerialTimeoutException):
+                written += port.write(junk)
+        port.reset_output_buffer()
+        answered = False
+        while not answered and time.monotonic() - began < 20.0:
+            port.reset_input_buffer()
+            port.write(PING)
+            answered = PONG in port.read(4096)
+        assert answered
+        assert time.monotonic() - began < 5.0
+        assert written < 1_000_000
 
 
 def test_the_terminals_baud_is_the_buss(serve: Serve) -> None:
