@@ -16,6 +16,7 @@ import numpy as np
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
+from hil.estimation.unsettled.slips import unexplained
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.baselines.torque_faults import suspect_stop
 from hil.estimator.data.recording import Recording
@@ -82,8 +83,8 @@ def resting_on_stop(config: Config, seen: Seen) -> str:
         return ""
     return (
         f"{config.joints[stop.joint - 1].joint.title} rests against something compliant (a stop, a table or a cable) "
-        f"at {stop.at:.2f} rad: with a stiffness of {float(f'{stop.stiffness:.2g}'):g} N m/rad there, inverse dynamics "
-        f"leaves {100 * stop.residual:.2g} % of the torque unexplained instead of {100 * stop.residual_given:.2g} %. "
+        f"at {stop.at:.2f} rad: with a stiffness of {float(f'{stop.stiffness:.2g}'):g} N m/rad there, "
+        f"{unexplained(stop.residual, stop.residual_given)}. "
         "In every further run, the arm would press and bounce against it, and the model of a planar arm includes no "
         "stops. Change the mounting, or what the arm rests on, so that the arm hangs freely, then correct "
         "arm.rest_pose; or describe the arm with a URDF, in which joints may rest against their stops."

@@ -8,6 +8,7 @@ import numpy as np
 from hil.estimation.unsettled.agreement import disagreement
 from hil.estimation.unsettled.defects import defect_said, is_certain, is_other_arm, likely_defect
 from hil.estimation.unsettled.local_defects import local_defects, local_residual
+from hil.estimation.unsettled.slips import unexplained
 from hil.estimator.arrays import Array
 from hil.estimator.baselines.torque_faults import (
     Clipped,
@@ -86,9 +87,8 @@ def _stop_said(stop: Stop) -> str:
     than, stiffness = "above" if stop.side > 0 else "below", float(f"{stop.stiffness:.2g}")
     return (
         f"Joint {stop.joint} seems to press against something that yields (a stop, a cable or an object) {than} about "
-        f"{stop.at:.3g} rad: with a stiffness of {stiffness:g} N m/rad there, inverse dynamics leaves "
-        f"{100 * stop.residual:.2g} % of the torque unexplained instead of {100 * stop.residual_given:.2g} %. Record "
-        "a motion that does not reach that angle."
+        f"{stop.at:.3g} rad: with a stiffness of {stiffness:g} N m/rad there, "
+        f"{unexplained(stop.residual, stop.residual_given)}. Record a motion that does not reach that angle."
     )
 
 
@@ -96,8 +96,7 @@ def _clipped(recordings: Sequence[Recording], found: Sequence[Clipped]) -> tuple
     return tuple(
         f"{_unsigned(recordings, each.joint)}The torque of joint {each.joint} seems to have been limited to about "
         f"{each.level:.3g} N m; its column exceeds this value in {100 * each.beyond:.2g} % of the samples. With "
-        f"this limit, inverse dynamics leaves {100 * each.residual:.2g} % of the torque unexplained instead of "
-        f"{100 * each.residual_given:.2g} %. A "
+        f"this limit, {unexplained(each.residual, each.residual_given)}. A "
         "current limit or the supply voltage clips it (saturation): use the measured current, or smaller commands."
         for each in found
     )
@@ -146,7 +145,7 @@ def _drifting(recordings: Sequence[Recording]) -> tuple[str, ...]:
         return ()
     return (
         f"The delay of the torque drifts from {1e3 * drift.start:+.3g} ms to {1e3 * drift.end:+.3g} ms over the "
-        f"recording ({1e6 * drift.relative:+.0f} ppm): allowing for this, inverse dynamics leaves "
-        f"{100 * drift.residual:.2g} % of the torque unexplained instead of {100 * drift.residual_given:.2g} %. Torque "
-        "and position were timed by different clocks: correct the times of one, or log both with the same clock.",
+        f"recording ({1e6 * drift.relative:+.0f} ppm): allowing for this, "
+        f"{unexplained(drift.residual, drift.residual_given)}. Torque and position were timed by different "
+        "clocks: correct the times of one, or log both with the same clock.",
     )

@@ -27,6 +27,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
 from hil.estimator.models.conflicts import Conflict, conflicts
+from hil.estimator.models.parameters import CONSTANTS, OWN_INERTIA
 from hil.estimator.selection.segment_verdict import SegmentEvidence, judge_segments
 from hil.estimator.selection.segments import considered, missing_terms, predicted_positions
 from hil.estimator.selection.unsettled import SegmentChoice, choose_by_shooting, held_out_error
@@ -162,9 +163,9 @@ def _with_late_back_emf(estimate: ShootingEstimate, brakes: Sequence[float | Non
     due to back-EMF times the lag. A recording does not state the lag and hardly reveals it.
     """
     covariance = estimate.covariance.copy()
-    for joint, brake in enumerate(brakes, 1):
-        viscous = max(estimate.parameters[f"viscous_{joint}"], 0.0)
-        place = estimate.names.index("inertia_1" if joint == 1 else "armature_2")
+    for joint, brake in enumerate(brakes):
+        viscous = max(estimate.parameters[f"viscous_{joint + 1}"], 0.0)
+        place = estimate.names.index(CONSTANTS[OWN_INERTIA[joint]])
         covariance[place, place] += (LAG_S * (viscous if brake is None else brake)) ** 2
     return replace(estimate, covariance=covariance)
 

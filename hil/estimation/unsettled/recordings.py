@@ -201,14 +201,14 @@ def _brakes(columns: Columns) -> tuple[float | None, ...]:
 
 def _back_emf(columns: Columns, result: ShootingResult) -> list[str]:
     """State how much of the viscous friction of voltage-driven joints is due to back-EMF."""
-    gains = columns.gains
-    if columns.drive not in {"voltage", "pwm"} or gains is None:
+    brakes = _brakes(columns)
+    if not brakes:
         return []
     if columns.torque_constant is None:
         return ["The joints are driven by voltage, so viscous friction includes braking by back-EMF."]
     parts = [
         f"{brake:.3g} of {result.parameters[f'viscous_{joint}'].value:.3g} N m s/rad in joint {joint}"
-        for joint, brake in enumerate(_brakes(columns), 1)
+        for joint, brake in enumerate(brakes, 1)
     ]
     return [f"The joints are driven by voltage, so viscous friction includes braking by back-EMF: {', '.join(parts)}."]
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.estimation.unsettled.slips import unexplained
 from hil.estimator.baselines.signs import suspect_signs
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
@@ -71,9 +72,9 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
     seem, changed = ("seem", "these signs") if several else ("seems", "the sign")
     negative = f"; as given, {', '.join(suspicion.impossible)} would be negative" if suspicion.impossible else ""
     return [
-        f"{subject.capitalize()} {seem} to be reversed: with {changed} changed, inverse dynamics leaves "
-        f"{100 * suspicion.residual:.2g} % of the torque unexplained instead of {100 * suspicion.residual_given:.2g} %"
-        f"{negative}. Correct that in the file, or swap the columns."
+        f"{subject.capitalize()} {seem} to be reversed: with {changed} changed, "
+        f"{unexplained(suspicion.residual, suspicion.residual_given)}{negative}. Correct that in "
+        "the file, or swap the columns."
     ]
 
 
