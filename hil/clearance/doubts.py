@@ -13,7 +13,7 @@ from hil.drivers.servo_prior import servo_prior
 from hil.next_step import command
 
 _LEANS = 0.35
-"""Cosine of a link's angle at rest from which gravity clearly pulls it aside."""
+"""Absolute cosine of a link's angle at rest above which gravity clearly pulls the link to one side."""
 
 
 def doubts(config: Config) -> Iterator[str]:
@@ -50,9 +50,9 @@ def _leaning(config: Config) -> Iterator[str]:
     away = abs(math.degrees(math.remainder(angle + math.pi / 2, math.tau)))
     yield (
         f"At arm.rest_pose, the link of joint {joint.name!r} is {away:.0f} "
-        "degrees away from hanging straight down, so without torque only friction or a stop holds it there. A planar "
-        "arm's stops are not part of its model: if it rests against one, change the mounting so that it hangs freely, "
-        "or describe the arm by a URDF, whose joints may rest against their stops."
+        "degrees away from hanging straight down, so without torque only friction or an end stop holds it there. "
+        "The model of a planar arm includes no end stops: if the arm rests against one, change the mounting so that it "
+        "hangs freely, or describe the arm with a URDF, in which case joints may rest against end stops."
     )
 
 

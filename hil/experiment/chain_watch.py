@@ -1,10 +1,11 @@
 """Check during the experiment that a spatial arm's motion is consistent with some arm of the dry run's ensemble.
 
-Prior knowledge is the ensemble's mean and inflated covariance. While the arm is in its rest pose, something may support
-it, so no joint is judged. A joint that stands still at its rest angle may be lying against an end stop, so it is
-judged only while torque acts towards the side on which it has been. The same applies to a joint that has just come back
-to that angle, since it may have hit the stop. A joint that has not left its rest angle yet may be lying against a stop
-on the side to which gravity pulls it: it is judged only while its torque acts towards that side.
+The prior knowledge is the ensemble's mean and inflated covariance. While the arm is in its rest pose, something may
+support it, so no joint is judged. A joint that stands still at its rest angle may be lying against an end stop, so it
+is judged only while torque pushes it back towards the side from which it came. The same applies to a joint that has
+just returned to that angle, since it may have hit the end stop. A joint that has not yet left its rest angle may be
+lying against an end stop on the side towards which gravity pulls it: it is judged only while its torque acts towards
+that side.
 """
 
 import math
@@ -38,8 +39,8 @@ friction of up to twice the mean from raising an alarm.
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
 _IMPACT_S, _MOST_REBOUND = 0.05, 0.5
-"""How long a joint that has come back to its rest angle may bounce off a stop [s], and its largest speed while it
-bounces, relative to the speed before the impact.
+"""How long a joint that has returned to its rest angle may bounce off an end stop [s], and its largest speed while it
+bounces, relative to its speed before the impact.
 """
 WINDOW_S = 0.3
 """Time span [s] for which a message about a stationary joint gives the range of torques."""
@@ -83,7 +84,7 @@ class ChainWatch:
         self._velocity = np.zeros(n)
         """Latest velocities (joints,) [rad/s]."""
         self._hit_at, self._hit_speed = np.full(n, -np.inf), np.zeros(n)
-        """When each joint may last have hit a stop near its rest angle [s], and its speed before the impact [rad/s]."""
+        """When each joint may last have hit an end stop near its rest angle [s], and its speed before that [rad/s]."""
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
@@ -97,7 +98,7 @@ class ChainWatch:
         return Residual(self._observer.lacking, self._observer.torque, self._observer.is_beyond)
 
     def observe(self, state: State) -> int:
-        """Process a sample without raising anything; return the joint whose motion is inconsistent, -1 if none is."""
+        """Process a sample without raising an exception; return the joint whose motion is inconsistent, or -1."""
         if any(state.missing):
             return -1
         goal, self._goal = self._goal, state.goal_current
@@ -117,14 +118,14 @@ class ChainWatch:
         return self._observer.observe(position, velocity, torque, seconds, is_free, support)
 
     def _support(self, is_away: Mask, velocity: Array, torque: Array) -> Array:
-        """Direction in which a stop may block each joint (joints,): 1, -1, or 0.
+        """Direction in which an end stop may block each joint (joints,): 1, -1, or 0 if none can.
 
         is_away: whether each joint is away from its rest angle. torque: commanded (joints,) [N m].
         """
         may_lie = ~self._was_below & ~self._was_above & (torque * self._falls_to <= self._friction)
         towards = np.where(may_lie, self._falls_to, self._was_below * 1.0 - self._was_above * 1.0)
         approach, before = velocity * towards, self._velocity * towards
-        hits = ~is_away & (before > _STILL_RAD_S) & (approach < before)  # a stop can only slow a joint down
+        hits = ~is_away & (before > _STILL_RAD_S) & (approach < before)  # an end stop can only slow a joint down
         is_recent = self._seen_at - self._hit_at <= _IMPACT_S
         self._hit_speed = np.where(hits, np.maximum(before, is_recent * self._hit_speed), self._hit_speed)
         self._hit_at = np.where(hits, self._seen_at, self._hit_at)

@@ -22,7 +22,7 @@ class CommandLimits:
         if len(goals) != len(limits):
             raise ValueError(f"{len(goals)} goals for {len(limits)} joints")
         clamped = []
-        # Without a comprehension and a keyword argument (strict), which take longer than the rest with cold caches.
+        # No comprehension and no keyword argument (strict): with cold caches, they would take longer than all the rest.
         for index, goal in enumerate(goals):
             limit = limits[index]
             if -limit <= goal <= limit and -slew <= goal - former[index] <= slew:

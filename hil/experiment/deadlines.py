@@ -40,7 +40,7 @@ class Deadlines:
         came.
         """
         self.any_missed = False
-        """Whether some deadlines have been missed recently, i.e. are not yet offset by deadlines met since."""
+        """Whether recently missed deadlines have not yet been offset by deadlines met since."""
 
     def missed(self, seconds: float = 0.0, *, waited: bool = False) -> None:
         """Record a missed deadline, `seconds` after the last command.
@@ -101,7 +101,7 @@ class Deadlines:
         if seconds < self._watchdog:
             return ""
         # Whether another program had disarmed them is not known afterwards: cutting torque disarms them too.
-        return f" Watchdogs that were still armed had cut the current after {1e3 * self._watchdog:.0f} ms."
+        return f" Watchdogs that were still armed cut the current after {1e3 * self._watchdog:.0f} ms."
 
 
 def _told(seconds: float) -> str:

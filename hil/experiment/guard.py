@@ -89,7 +89,7 @@ class Guard:
         self._names = [str(joint.joint) for joint in config.joints]
         self._safety = safety
         self._left_by_a_run = left_by_a_run
-        # A pilot lowers the torque itself after such a stop.
+        # After a stop at a limit, a pilot lowers the torque itself.
         self._is_lowering = is_lowering = lowers_since is not None
         lower = (
             ""
@@ -105,7 +105,7 @@ class Guard:
         planned = planned or _planned(config)
         interval = 1.0 / rate if interval is None else interval
         self.recent = RecentMotion(config, interval) if recent is None else recent
-        """The latest exchanges, including those during a stop."""
+        """The latest exchanges, including those made while the arm is being stopped."""
         self._silence = Silence(config, interval, patience, lowers_since)
         self._patience = patience or float("inf")
         self._late_after = self._patience + LATE_WAKE_UP_S
@@ -186,7 +186,7 @@ class Guard:
         """Check an exchange with missing replies or with errors in replies, or one that follows such an exchange."""
         now, missing, error = state.time_before_write, state.missing, state.error
         self._silence.ask(now)
-        # While the arm is being lowered, an exchange may be awaited for a good part of the time that is allowed.
+        # While the arm is being lowered, waiting for replies may take up much of the allowed time.
         silent = state.time_after_read if self._is_lowering else now
         for index in range(len(missing)):
             if error[index] & ALERT and not self._is_lowering:
@@ -232,8 +232,8 @@ class Guard:
         self._stop(index, *TORQUE_LOST)
 
     def rests_at(self, positions: Sequence[float]) -> None:
-        """Store the angles that the joints had before torque was switched on [rad]; by default, those of the first
-        sample are used. From now on, `measure_noise` is called with each exchange until `noise_is_known`.
+        """Store the angles that the joints had before torque was switched on [rad]; without this call, those of the
+        first sample are used. After it, `measure_noise` must be called with each exchange until `noise_is_known`.
         """
         self._resting = positions
         self._noise.begin()
@@ -245,9 +245,9 @@ class Guard:
         self._noise.add(state)
 
     def noise_is_known(self) -> list[str]:
-        """End the measurement of noise; return what it means for each joint whose current reading is noisy.
+        """End the noise measurement; return a message for each joint whose current reading is noisy.
 
-        Raises SafetyStop if a reading is too noisy for a check of the current.
+        Raises SafetyStop if a reading is too noisy for the current to be checked.
         """
         noisy = self._noise.end()
         for joint in noisy:
@@ -346,7 +346,7 @@ class Guard:
     def _silence_remedy(self, unheard: Unheard) -> str:
         if unheard is Unheard.ONE:
             return "Requests or replies are lost: check its cable and its supply."
-        # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
+        # A silent servo also hides the replies of those after it; which servos answer is found out once torque is off.
         shared = "No servo replied; requests or replies are lost: check the adapter, the cables and the supply"
         if self._silence.is_busy:
             return f"{shared}, and whether other programs keep this computer busy, since this program was running late."

@@ -93,7 +93,7 @@ _USUAL_S = 1.0
 _GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which changes of velocity are not checked."""
 _WINDOW_S = 0.3
-"""Time span [s] for which a message about a stationary joint gives the range of torques: one value may be near zero."""
+"""Time span [s] for which a message about a stationary joint gives the torque range: one value alone may be near 0."""
 
 
 JOLT = np.dtype(
@@ -361,12 +361,12 @@ class ModelWatch:
         raise SafetyStop(said + self._near_limit(joint, state.position[joint]), Cause.UNEXPECTED)
 
     def _near_limit(self, joint: int, angle: float) -> str:
-        """Return the sentence for a joint that may have met a hard stop; "" if it is far from its position limits."""
+        """Return a sentence if a joint may have hit a hard stop; "" if it is far from its position limits."""
         low, high = self._limits[joint]
         limit = low if angle - low < high - angle else high
         if abs(angle - limit) > _NEAR_LIMIT * (high - low):
             return ""
-        return f" It is at {angle:.2f} rad, close to its limit of {limit:g} rad: it may have met a hard stop there."
+        return f" It is at {angle:.2f} rad, close to its limit of {limit:g} rad: it may have hit a hard stop there."
 
 
 def standing_for(states: Iterable[State], joint: int) -> float:
@@ -445,7 +445,7 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
 
 
 def _slowness(experiment: ExperimentConfig) -> float:
-    """Return how many times slower than usual the excitation is; at least 1."""
+    """Return the factor by which the excitation is slower than usual; at least 1."""
     if experiment.band is not None:
         low, high = experiment.band
     else:

@@ -13,8 +13,8 @@ _FORGETS = 0.98
 
 
 def read_back(bus: ServoBus, guard: Guard, due: float) -> None:
-    """Check for goals from another program just before the exchange due at `due` [s]; report lost goals, lost torque
-    and changed watchdogs to the guard.
+    """Check for goals from another program just before the exchange scheduled for `due` [s]; report lost goals, lost
+    torque and changed watchdogs to the guard.
     """
     bus.check_not_overruled(due)
     if (changed := bus.watchdog_changed) is not None:

@@ -1,6 +1,6 @@
 """Comparison of successive periods sample by sample, which avoids a burst of work at the end of a period.
 
-Differences are measured as in `hil.estimator.data.periodicity.settling_difference`, but summed up during the period.
+Differences are measured as in `hil.estimator.data.periodicity.settling_difference`, but accumulated during the period.
 
 The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same
 sample of the previous period. If they differ by more than `TIMES` times the RMS difference between the two previous

@@ -127,7 +127,7 @@ def run_experiment(
 
 @contextmanager
 def _with_torque(torque: str) -> Iterator[None]:
-    """Append the torque state to errors from closing the recording, and to stop requests while torque is cut."""
+    """Append the torque state to errors from closing the recording, and to stop requests deferred until then."""
     try:
         yield
     except (RunFolderError, StopRequested) as error:
@@ -224,7 +224,7 @@ def _try_again(bus: ServoBus, note: Note) -> None:
 
 def _why_silent(bus: ServoBus, stop: SafetyStop) -> str:
     """Say that replies were late if they arrived after torque was cut. Otherwise, if no servo was heard, say which ones
-    answered after that: a silent servo hides the replies of those after it.
+    answered later: a silent servo hides the replies of those after it.
     """
     report = bus.torque_off_report
     if stop.unheard is None or report is None:
@@ -314,8 +314,8 @@ def _watched(clock: Clock, watch: Watch) -> Iterator[Watch]:
 def _wait_for_rest(config: Config, bus: ServoBus) -> Lies:
     """Wait until a swinging arm has come to rest; return the servos' positions.
 
-    Raises ExperimentError if it has moved far since the start, or a spatial arm does not come to rest; BusShared if
-    another program switches torque on.
+    Raises ExperimentError if the arm has moved far since the start, or if a spatial arm does not come to rest; and
+    BusShared if another program switches torque on.
     """
     bus.refuse_switched_on()
     lay, lies = lay_at_start(), where_it_lies(bus)
@@ -364,7 +364,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
 def _check_pose(config: Config, bus: ServoBus) -> None:
     """Check that the arm is in its rest pose; if it is not, zero_ticks, direction or the arm's description is wrong.
 
-    After a run that passed this check, friction may hold the arm at up to twice the tolerance.
+    After a run that passed this check, friction may hold the arm up to twice the tolerance away from it.
     """
     if has_moved():
         _check_inside(config, bus)

@@ -24,7 +24,7 @@ LATE_WAKE_UP_S = 1e-3
 """Lateness of this program that indicates a busy computer [s]; on an idle one, it is less than a third of this."""
 
 BUSY_S = 2.0
-"""How long a computer counts as busy after this program was late [s]."""
+"""How long the computer counts as busy after this program has woken up late [s]."""
 
 
 class Silence:
@@ -54,7 +54,7 @@ class Silence:
         self.any_missed = False
         """Whether any joint has missed the latest reply."""
         self.others_answer = False
-        """Whether the servos whose replies are missing are known to answer: a silent servo hides their replies."""
+        """Whether some servos that seem silent are known to reply: a silent servo hides their replies."""
 
     @property
     def is_busy(self) -> bool:
@@ -92,8 +92,7 @@ class Silence:
         now: when that exchange began, or when waiting for its replies ended [s].
 
         answered: whether the servo answered with an error instead of its state. refused: whether that error shows that
-        it received the request undamaged; one such answer is enough. alone: whether only this servo is silent, i.e.
-        another one was heard.
+        it received the request undamaged; one such answer is enough. alone: whether at least one other servo was heard.
         """
         last = max(self._last_heard[joint], self._all_heard_at)
         if last == -inf:
@@ -106,7 +105,7 @@ class Silence:
         elapsed = max(now - last, listened)
         count = self.counts[joint] + refused
         count += self._already  # replies may have been missing before the arm was lowered
-        # A servo that was heard, if only with an error, was not kept from being heard by this computer.
+        # If the servo answered at all, even with an error, a busy computer did not hide its reply.
         together = self._blind if self.is_busy and not answered else self._limit
         allowed = self._alone if alone or self.others_answer else together
         for seconds, limit in ((listened, allowed), (elapsed, self._blind)):
@@ -116,7 +115,7 @@ class Silence:
         return None
 
     def _delayed(self, seconds: float) -> str:
-        """Say how much of a silence this computer caused [s]; during lowering, only if it is known to be busy."""
+        """Say that this computer caused `seconds` [s] of a silence; during lowering, only if it is known to be busy."""
         is_told = seconds >= LATE_WAKE_UP_S and (self.is_busy or not self._already)
         return f", {_ms(seconds)} of it because this computer was busy" if is_told else ""
 

@@ -20,7 +20,7 @@ from hil.errors import Cause
 
 _WRAP_S = 32.768
 _CLOCK_TOLERANCE_S = 0.004
-"""Largest lag of a servo's clock, which counts milliseconds, behind its expected value [s]."""
+"""Largest accepted lag of a servo's clock, which counts milliseconds, behind its expected value [s]."""
 
 _TICK_S = 3e-3
 """Time after which a clock that counts milliseconds must have advanced [s]."""
@@ -280,5 +280,5 @@ def _unlike_armed(longer: int) -> str:
 
 
 def _wrapped(seconds: float) -> float:
-    """Wrap a difference between two clocks to within half of the time after which a servo's clock starts again."""
+    """Wrap a difference between two clocks to plus or minus half the wrap-around period of a servo's clock."""
     return (seconds + 0.5 * _WRAP_S) % _WRAP_S - 0.5 * _WRAP_S

@@ -212,7 +212,7 @@ class Stream:
         state = self._play(self._silence(self._plan.rest_samples), Phase.REST)
         moving = self._moving(state)
         window = rest_window(self._plan.rate)
-        # The stabiliser may first have to bring it back from where the previous run was stopped.
+        # The stabiliser may first have to bring the arm back from where the previous run was stopped.
         for _ in range(0, self._plan.end_samples if self._left_by_a_run else 0, window):
             if not moving:
                 break
@@ -439,7 +439,7 @@ class Stream:
                 goals = None if state is None else brake.goals(state)
                 if goals is None:
                     return
-                # The first brake is sent at once: until then the goals that led to the stop drive the arm.
+                # The first braking goals are sent at once: until then, the goals that led to the stop drive the arm.
                 deadline, _, late = ticks.wait() if number else (clock.now(), 0.0, False)
                 if late or self._stop.insisted:
                     return

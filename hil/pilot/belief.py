@@ -89,7 +89,7 @@ class Belief:
         return float(self.coordinates[:, self.names.index(name)].std())
 
     def ensemble(self, farther: float = 1.0) -> Ensemble:
-        """Ensemble for a dry run. farther: range of motion to be simulated, relative to the observed one."""
+        """Return the ensemble for a dry run. farther: range of motion to simulate, relative to the observed range."""
         belief = self if not self.learned else self._widened(_LEAST_SPREAD * (1.0 + np.log2(max(1.0, farther))))
         parameters = belief.parameters
         joints = 2 if "torque_scale_2" in parameters[0] else 1

@@ -1,12 +1,12 @@
 """Breakaway of joints held by friction: torque rises from run to run, and a run ends soon after a joint moves.
 
 Just above a joint's static friction, motion grows quickly: on many of the plausible arms even a few percent more torque
-makes a joint exceed a limit. Therefore the guard is given narrow limits for such joints, and the torque is raised by a
+makes a joint exceed a limit. The guard is therefore given narrow limits for such joints, and the torque is raised by a
 constant ratio from run to run, up to the current limit. As soon as the joint moves and so reveals its friction, the arm
 is braked and the run ends.
 
-A joint that gravity presses against a stop also stands still until its torque lifts it. In the following runs, it would
-bounce on the stop, which the model of a planar arm does not include.
+A joint that gravity presses against an end stop also stands still until its torque lifts it. In the following runs, it
+would bounce on this end stop, which the model of a planar arm does not include.
 """
 
 import math
@@ -25,13 +25,13 @@ from hil.pilot.options import PilotOptions
 from hil.pilot.seen import Seen
 
 _LEANS = 0.1
-"""Smallest cosine of a link's angle at rest at which gravity may press the link against something."""
+"""Smallest absolute cosine of a link's angle at rest for which gravity may press the link against something."""
 
 _AT_REST_RAD = 0.03
-"""Largest distance between a stop and the pose before the run [rad]."""
+"""Largest distance between an end stop and the joint's angle before the run [rad]."""
 
 _UNEXPLAINED = 0.25
-"""Smallest fraction of the torque that inverse dynamics must leave unexplained without a stop."""
+"""Fraction of the torque that inverse dynamics without an end stop must leave unexplained for one to be suspected."""
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
@@ -82,10 +82,10 @@ def resting_on_stop(config: Config, seen: Seen) -> str:
     if stop is None or stop.residual_given < _UNEXPLAINED or abs(stop.at - seen.pose[stop.joint - 1]) > _AT_REST_RAD:
         return ""
     return (
-        f"{config.joints[stop.joint - 1].joint.title} rests against something compliant (a stop, a table or a cable) "
-        f"at {stop.at:.2f} rad: with a stiffness of {float(f'{stop.stiffness:.2g}'):g} N m/rad there, "
+        f"{config.joints[stop.joint - 1].joint.title} rests against something compliant (an end stop, a table or a "
+        f"cable) at {stop.at:.2f} rad: with a stiffness of {float(f'{stop.stiffness:.2g}'):g} N m/rad there, "
         f"{unexplained(stop.residual, stop.residual_given)}. "
         "In every further run, the arm would press and bounce against it, and the model of a planar arm includes no "
-        "stops. Change the mounting, or what the arm rests on, so that the arm hangs freely, then correct "
-        "arm.rest_pose; or describe the arm with a URDF, in which joints may rest against their stops."
+        "end stops. Change the mounting, or what the arm rests on, so that the arm hangs freely, then correct "
+        "arm.rest_pose; or describe the arm with a URDF, in which case joints may rest against end stops."
     )

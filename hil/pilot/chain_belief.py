@@ -124,7 +124,7 @@ class ChainBelief:
         for arm, each in enumerate(drawn):
             shaken = torque + noise[:, None] * random.standard_normal(torque.shape)
             moved[arm] = each + spread @ np.einsum("jki,jk->i", Y * weight, shaken - Y @ each)
-        # Base parameters may be large and nearly cancel, so it is the links that vary.
+        # Base parameters may be large and nearly cancel, so the parameters of the links are varied instead.
         moved[:, :count] += _MODEL_SPREAD * random.standard_normal((len(moved), everything.shape[1])) @ everything.T
         friction = _MODEL_SPREAD * np.abs(fitted[count:])
         moved[:, count:] += friction * random.standard_normal((len(moved), friction.size))

@@ -126,7 +126,7 @@ class ChainSearch(SafeShares):
         return found
 
     def limit_after(self, error: ExperimentError, found: Found) -> None:
-        """Reduce the largest allowed amplitude after a stopped run, unless it did not settle or a joint stood still."""
+        """Reduce the largest allowed amplitude after a run was stopped, but not if it never settled or a joint stood still."""
         if not isinstance(error, NotSettled | DidNotMove):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 

@@ -147,7 +147,7 @@ class SafeShares:
         )
 
     def _helped_by_rate(self, config: Config, shares: tuple[float, ...]) -> str:
-        """Name a higher rate at which a path would be safe, since the spring would be stiffer; "" if there is none."""
+        """Name a higher rate at which a path would be safe because the spring would be stiffer; "" if there is none."""
         if self.given.stabiliser is not None:
             return ""
         experiment = self.given.experiment

@@ -28,7 +28,7 @@ def identify_in_steps(
 ) -> tuple[str, SettledResult]:
     """Identify an arm from link lengths alone, or from an `earlier` result for the same arm.
 
-    Returns two values: the sentence about the torque state, and the result.
+    Returns a sentence about the torque state, and the result.
 
     Raises the same errors as a run, and ExperimentError if a joint does not move at its current limit.
     """
@@ -52,8 +52,9 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
     """Play the full run; repeat it with less torque if it exceeded a limit, with other waves if it did not settle, and
     at higher frequencies if friction held a joint.
 
-    Friction may stop an arm in a different place in every period, however long it moves, so each repetition tolerates a
-    larger difference. The fit does not need equal periods, and the verdict says how well they are predicted.
+    Friction may stop an arm in a different place in every period, however long it keeps moving, so each repetition
+    tolerates a larger difference. The fit does not need identical periods, and the verdict says how well they are
+    predicted.
     """
     run, say, options = search.run, search.player.say, search.options
     number = unlike = 0

@@ -94,7 +94,7 @@ def _at_rate(rate: float, stiffness: Array, damping: Array, usual: Array, lighte
 
 
 def _sufficient_rates(damping: Array, least: Array, usual: Array, lightest: Array) -> Array:
-    """Return each joint's lowest rate (joints,) [Hz] at which `_at_rate` finds the stiffness that gravity requires."""
+    """Return each joint's lowest rate (joints,) [Hz] at which `_at_rate` reaches the stiffness that gravity requires."""
     product = DELAY_SAMPLES * least / _DRIVEN  # of rate and damping
     grown = MOST_DAMPING * lightest  # damping per rate
     root = np.sqrt(usual**2 + 4.0 * grown * product)

@@ -81,8 +81,8 @@ class PilotOptions:
     max_unlike_runs: int = 3
     """Maximum number of full runs that may end because one period differed from the one before."""
     band_raise: float = 3.0
-    """Factor by which the lower end of experiment.band is raised if friction holds a joint during a full run."""
+    """Factor by which the lower limit of experiment.band is raised if friction holds a joint during a full run."""
     max_low: float = 0.35
-    """Highest lower end of experiment.band that a repeated full run may use, as a fraction of the upper end."""
+    """Highest lower limit of experiment.band for a repeated full run, as a fraction of the upper limit."""
     max_settle_within: float = 0.1
-    """Largest experiment.settle_within that a repeated full run accepts."""
+    """Largest experiment.settle_within for a repeated full run."""

@@ -1,7 +1,7 @@
 """From the first careful run to a plan at the limits: run, update the belief, and raise the torque until the belief is
 precise.
 
-A run that moved nothing, exceeded a limit or never settled is informative too.
+A run in which nothing moved, a limit was exceeded or the motion never settled is informative too.
 """
 
 from collections.abc import Iterator
@@ -108,7 +108,7 @@ class Search:
     def learn(self, config: Config, played: Played) -> None:
         """Update the belief with the outcome of a run of `config`.
 
-        Raises ExperimentError if the run shows that the arm rests on a stop.
+        Raises ExperimentError if the run shows that the arm rests against an end stop or something else.
         """
         self.steps.append(played.step)
         if config.stabiliser is not None:
@@ -278,8 +278,8 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """Return `found` or, if it leaves much of the position range unused, the best of it and other waves: the
-        amplitude whose motion covers the largest part of the range.
+        """Return `found`. If it leaves much of the position range unused, try other waves too, and return the amplitude
+        whose motion covers the largest part of the range.
         """
         options = self.options
         limited = (found.peak_torque >= options.at_limit * most_torque(config)).all() or self.cap is not None
@@ -294,7 +294,7 @@ class Search:
 
     def _play(self, config: Config, folder: str, name: str, found: Amplitude) -> None:
         played_config = with_torque(config, found.peak_torque)
-        # The first period is informative even if unsettled; the ramp out, unlike a cut, lets the arm come to rest.
+        # The first period is informative even if unsettled; unlike cutting torque, a ramp out lets the arm come to rest.
         calm = Amplitude(replace(found.plan, settle_within=np.inf), found.peak_torque, found.prediction)
         played = self.play(played_config, self.run.below(folder, played_config), name, calm)
         self.learn(played_config, played)

@@ -1,4 +1,4 @@
-"""The speed up to which the supply can drive the commanded currents, learned from a stop.
+"""The speed up to which the supply can drive the commanded currents, learned from a stopped run.
 
 Back-EMF rises with speed. If it leaves too little of the supply voltage, a motor carries less current than commanded,
 and the motion no longer determines the arm's parameters.
@@ -17,7 +17,7 @@ from hil.runs.recording import Phase
 
 _DRIVEN = (Phase.RAMP_IN, Phase.WARM_UP, Phase.PERIODIC, Phase.RAMP_OUT)
 _LAST_S = 0.25
-"""Time before a stop within which the sample that caused it is searched for [s]."""
+"""Time before the end of a stopped run within which to search for the sample that caused the stop [s]."""
 
 
 def delivered_speed(config: Config, samples: NDArray[np.void]) -> Array:

@@ -39,7 +39,7 @@ class ExchangeMode:
     """Measured timing of one exchange mode.
 
     median_s, longest_s: round trips [s]. usual_s, slowest_s: 90 % quantile and median of the round trips with the
-    slowest kind of read [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
+    slowest kind of read [s]. lost: number of exchanges, out of CYCLES, with replies that were lost, not just late.
     """
 
     one_write: bool
@@ -65,7 +65,7 @@ class ExchangeMode:
 
     @property
     def whole_rate(self) -> int:
-        """`rate` in whole Hz, rounded down, so that it is accepted."""
+        """`rate` in whole Hz, rounded down, so that a later check accepts it."""
         return floor(self.rate + 1e-6)
 
     def __str__(self) -> str:
@@ -117,10 +117,10 @@ def seldom_read_back(bus: ServoBus, exchange: ReadBackExchange, off_wire: float)
     every, shortest = exchange.read_back_every(off_wire)
     if not every:
         return ""
-    often = "not at all" if isinf(every) else f"only about every {1e3 * every:.0f} ms"
+    often = "never read back" if isinf(every) else f"read back only about every {1e3 * every:.0f} ms"
     return (
         f"At {1 / bus.config.interval:g} Hz and {bus.port.baud} baud, cycles leave too little time to read back what "
-        f"the servos hold: their goals are read back {often}, so another program that writes goals, or a servo that "
+        f"the servos hold: their goals are {often}, so another program that writes goals, or a servo that "
         f"has lost its torque, may be noticed late or never. There is enough time at {floor(1 / shortest)} Hz or less, "
         "or at a higher baud rate."
     )

@@ -17,12 +17,12 @@ from hil.drivers.joint import Joint
 from hil.estimator.arrays import Array
 from hil.rest_pose_hint import within_limits
 
-MOVED = 0.15  # rad: a joint that has been moved by hand
-STILL = 0.02  # rad in STILL_S: a joint that is held still
+MOVED = 0.15  # rad: a joint that has moved farther counts as moved by hand
+STILL = 0.02  # rad: a joint that moves less than this in STILL_S is held still
 STILL_S = 0.6
 POLL_S = 0.05
 PATIENCE_S = 60.0
-SEVERAL = 0.4  # of the largest motion: what another joint may move along with it
+SEVERAL = 0.4  # largest motion of another joint that is not reported, relative to that of the moved joint
 Read = Callable[[], tuple[float, ...]]
 ReadDrives = Callable[[Joint], tuple[float, ...]]
 
@@ -45,7 +45,7 @@ class Moved:
     asked: str
     """Request that was shown to the user."""
     angles: tuple[float, ...]
-    """Angles by which all joints moved [rad]."""
+    """Angle by which each joint moved [rad]."""
     well: bool
     found: str
     """Finding as text; if the motion differs from the description, also what to change."""

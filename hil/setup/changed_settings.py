@@ -75,7 +75,7 @@ def settings_now(bus: ServoBus, before: Settings | None = None) -> Settings:
     Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
     to an earlier request. If the two readings differ, the value is unknown and omitted, as are all values of a
     servo whose ID is read wrongly: its replies are late, so even equal values may be those of other registers. Values
-    that differ from `before` are confirmed once more, since another program would be accused of the change.
+    that differ from `before` are confirmed once more, since another program would be blamed for the change.
     """
     found: dict[tuple[Joint, str], int] = {}
     report = bus.torque_off_report

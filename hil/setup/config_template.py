@@ -123,7 +123,7 @@ def _joint(answers: JointAnswers) -> list[str]:
     published = servo.torque_per_volt if pwm else servo.torque_per_ampere
     constant, limit = ("torque_per_volt", "voltage_limit") if pwm else ("torque_constant", "current_limit")
     unit = "V" if pwm else "A"
-    figures = f"{published.low:.3g} to {published.high:.3g}" if published.high > published.low else "one figure"
+    figures = f"{published.low:.3g} to {published.high:.3g}" if published.high > published.low else "a single value"
     ends = [answers.rest - answers.swing, answers.rest + answers.swing]
     return [
         "[[joints]]",

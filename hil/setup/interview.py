@@ -89,8 +89,8 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
 
 
 def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: Ask, say: Say) -> list[int]:
-    """Return the Present Positions in the rest pose. Hanging joints are read after a push from either side, since
-    friction holds them.
+    """Return the Present Positions in the rest pose. A hanging arm is read twice, the second time after a push, since
+    friction may hold its joints to one side.
     """
     ask(_POSE[stance], "")
     first = [servo.read("Present Position") for servo in handles]
@@ -143,7 +143,7 @@ def _say_who_is_left_out(others: Sequence[Found], say: Say) -> None:
         ids = ", ".join(str(found.id) for found in others)
         say(
             f"LEFT OUT: ID {ids}. hil init describes planar arms of one or two joints; the other servos are neither "
-            "read nor moved, so hold or fix their joints. An arm with more joints, or one that is not planar, needs "
+            "read nor moved, so hold or clamp their joints. An arm with more joints, or one that is not planar, needs "
             "its URDF or MJCF: copy configs/open_manipulator_x.toml, name the description in [arm] urdf, then type: "
             "hil pose YOUR_FILE.toml"
         )

@@ -23,7 +23,7 @@ NEAR_RAD = 0.02
 """Largest deviation from arm.rest_pose at which it is still used as the rest pose [rad]."""
 
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
-"""Smallest motion after torque is cut that is reported, and largest deviation from the rest pose before it [rad]."""
+"""Smallest reported motion after torque is cut, and largest deviation from the rest pose before torque is cut [rad]."""
 
 _LONGEST_SAG_S = 3.0  # wait for an arm that moves after torque off
 
@@ -63,7 +63,7 @@ def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
 def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float]) -> str:
     """Return a message about a spatial arm that has moved out of its rest pose since torque was cut.
 
-    It is "" if the arm has not moved, was not in its rest pose, or does not answer. before: pose when torque was cut
+    Returns "" if the arm has not moved, was not in its rest pose, or does not answer. before: pose when torque was cut
     (joints,) [rad]. Raises BusShared if another program switches torque on in the meantime.
     """
     at, rest = np.array(before), np.array(config.arm.rest_pose)
@@ -83,7 +83,7 @@ def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float])
     if not moved:
         return ""
     pose = ", ".join(f"{each:.2f}" for each in after.tolist())
-    now = moving or f"If it lies there safely, set arm.rest_pose = [{pose}]; otherwise choose a pose in which it does."
+    now = moving or f"If it lies there safely, set arm.rest_pose = [{pose}]; otherwise choose another rest pose."
     return f"Once torque was off, the arm moved: {and_list(moved)}. It does not stay in its rest pose. {now}"
 
 

@@ -182,7 +182,7 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
 def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> Iterator[Finding]:
     """Check one servo; stop early if it does not answer or is of another model.
 
-    Nothing is written, except to restore settings that an earlier program left behind.
+    Nothing is written, except to restore settings that an earlier program changed and did not restore.
     """
     where = str(joint)
     try:

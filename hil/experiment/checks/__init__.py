@@ -1,1 +1,1 @@
-"""Checks of every sample, joint by joint, and the explanation of what they find."""
+"""Joint-by-joint checks of every sample, and explanations of the faults that they find."""

@@ -20,8 +20,9 @@ accumulate in this difference. The contributions of a healthy servo are known:
   fraction `CURVED` of the change of velocity times the interval remains. They do not cancel where the velocity jumps:
   in the slow memory, which contains many jumps, their sum is a random walk.
 
-Readings that jump back and forth, as with a stuck bit, cancel in these memories. Therefore each single interval is also
-compared with the encoder noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
+Readings that jump back and forth, as with a stuck bit, cancel in these memories. The difference over each single
+interval is therefore also compared with the encoder noise observed so far: `STEPS` jumps, each within `STEPS_S` of the
+one before, count as a fault.
 
 If a healthy servo reports exactly the same velocity for some time, the joint really moved at that velocity, except
 perhaps during the last `LAG_S`. The distance covered before that must therefore equal velocity times time; otherwise,
@@ -78,7 +79,7 @@ ticks), and its smallest ratio to the RMS of ordinary differences.
 """
 
 STEPS, STEPS_S = 4, 0.5
-"""Number of jumps that counts as a fault, and the longest time between them [s]."""
+"""Number of jumps that counts as a fault, and the longest time between one jump and the next [s]."""
 
 BLOCK_S = 0.0099
 """Shortest interval between two stored values of the distance covered while the velocity reading is unchanged [s]. The
@@ -165,10 +166,10 @@ difference, unknown: sums since the long memory was last updated; most_curved: t
 `difference`, except for motion that is too slow for the velocity register; behind: position minus that of a
 reference that follows such motion [rad]. headed: time of motion in the positive direction minus time of motion in the
 negative direction, since the same update [s]. rough: sum of squares of the errors that velocity jumps may have caused
-since then [rad^2]. heading, roughness, moving: what the slow memory holds of `headed`, `rough` and the time in motion
-[s]. learnt: information from which lag and scale error were estimated
-[rad^2/s]. lag, scale: their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the
-sums from which lag and scale error are estimated.
+since then [rad^2]. heading, roughness, moving: `headed`, `rough` and the time in motion, accumulated in the slow memory
+[s, rad^2, s]. learnt: information from which lag and scale error were estimated [rad^2/s]. lag, scale: their largest
+accepted values [s, 1]. The remaining fields hold the range of the bias and the sums from which lag and scale error are
+estimated.
 """
 
 
@@ -323,8 +324,9 @@ def _moved_at_rest(memory: Any, moved: float, seconds: float) -> float:
     """Process an interval in which the velocity reads zero; return the motion that contradicts this [rad].
 
     A reference follows the position at a speed of up to one step of the velocity. Where this is too slow, the reference
-    jumps, so that it is never more than `STEP_RAD` away from the position. The jump is returned. Encoder noise returns
-    to its mean, so it would accumulate in a sum of large position changes, but does not accumulate in these jumps.
+    jumps, so that it is never more than `STEP_RAD` away from the position. The jump is returned. Encoder noise would
+    accumulate in a sum of only the large position changes; it does not accumulate in these jumps, because it always
+    returns to its mean.
     """
     slow = RESOLUTION_RAD_S * seconds
     behind = memory.behind + moved
@@ -339,7 +341,7 @@ def _forget_sums(memory: Any) -> None:
 
 
 def _learn(memory: Any) -> None:
-    """Accept a multiple of the lag and scale error estimated so far instead of the largest that any servo may have."""
+    """Accept a multiple of the lag and scale error estimated so far, instead of the largest values for any servo."""
     lags = memory.lags
     memory.learnt = lags.information
     memory.lag = min(LAG_S, 2.0 * max(lags.lag, 0.0) + MORE_LAG_S + STDS * lags.lag_std)
@@ -377,7 +379,7 @@ def _is_frozen(same: Any, moved: float, velocity: float, seconds: float, unknown
 
 
 def _has_jumped(steps: Any, step: float, seconds: float) -> bool:
-    """Process the difference over one interval, minus what the motion explains [rad]; return whether it is faulty."""
+    """Process the unexplained part of the difference over one interval [rad]; return whether jumps are too frequent."""
     if seconds <= 0.0:
         return False
     steps.since += seconds
@@ -411,8 +413,8 @@ def _add(
 ) -> None:
     """Add one interval of `seconds`, at the end of which the joint has `velocity`.
 
-    moved, difference: change of position, and this minus the integral of velocity [rad]. curved, unknown: uncertainties
-    of the difference [rad]; only `unknown` accumulates.
+    moved: change of position [rad]. difference: this change minus the integral of velocity [rad]. curved, unknown:
+    uncertainties of the difference [rad]; only `unknown` accumulates.
     """
     kept = 1.0 - seconds / time_constant if seconds < time_constant else 0.0
     new = 1.0 - kept

@@ -23,7 +23,7 @@ FEWEST_READINGS, MOST_READINGS = 8, 256
 """Number of readings from which noise is first measured, and number of latest readings that are kept."""
 
 _UNCERTAIN = 1.9
-"""Largest error by which n readings underestimate the noise, as a multiple of the true noise divided by sqrt(n)."""
+"""Largest amount by which n readings underestimate the noise, as a multiple of the true noise divided by sqrt(n)."""
 
 _MAD_TO_SIGMA = 1.4826
 """Ratio of the standard deviation to the median absolute deviation for a normal distribution."""
@@ -65,7 +65,7 @@ class CurrentNoise:
         errors = np.array(self._errors)
         spread = np.median(np.abs(errors - np.median(errors, axis=0)), axis=0)
         noise = _MAD_TO_SIGMA * spread
-        # Rounding may have reduced the spread by half a tick; what it hides entirely is less than two.
+        # Rounding may have reduced the spread by half a tick; noise that it hides entirely is below two ticks.
         most = _MAD_TO_SIGMA * (spread + 0.5 * self._ticks) / (1.0 - _UNCERTAIN / len(errors) ** 0.5)
         hidden = np.minimum(most, following.SIGMA_TICKS * self._ticks)
         return noise.tolist(), np.where(spread > 0.25 * self._ticks, most, hidden).tolist()

@@ -10,18 +10,17 @@ standard deviation sigma, grows by
     [(distance from the commanded current)^2 - (distance from zero)^2] / (2 sigma^2)
 
 per sample. The step is bounded so that no single reply decides. The commanded current is any value between the last two
-goals, because a reply may be measured before or after the motor follows the latest goal, and may be off by a scale
-error of `GAIN_ERROR`.
+goals, because a reading may be taken before or after the motor follows the latest goal, and may have a scale error of
+`GAIN_ERROR`.
 
 Successive errors may be correlated, so each sample is weighted by the time that it represents. The unweighted sum must
-also reach h = `LEAST_RATIO`. From any given check on, a healthy motor's sum does so with a probability of at most
-exp(-h).
+also reach h = `LEAST_RATIO`. Starting from any given check, the probability that a healthy motor's sum ever reaches h
+is at most exp(-h).
 
 While a joint stands still, its readings may also freeze when its current equals the goal, and it may take seconds
 before the goal is far from this value. But a motor's current follows its goal: if the readings of position, velocity
 and current all stay exactly the same although the goals that they may reflect (those of the last `ANSWERS_S`) have
-changed, they are frozen.
-A constant sensor error cancels in this comparison.
+changed, they are frozen. A constant sensor error cancels in this comparison.
 
 A current sensor may be noisier than assumed. Its noise is measured at constant goals, while the arm rests before the
 start (`current_noise`), and is a lower bound on sigma: a noisy reading then means that lost torque is found later, not
@@ -85,8 +84,8 @@ GOALS = np.dtype(
 
 most: largest change of the goal under which all readings may stay the same [A or V]. carried, same_for: current, and
 how long all readings have been the same [s]. age: age of the latest block [s]. low, high: smallest and largest goal in
-each block, the latest first. lowest, highest: smallest upper end and largest lower end of the ranges of goals
-that the readings may have reflected since they last changed.
+each block, the latest first. lowest, highest: smallest upper and largest lower limit of the goal ranges that
+the readings may have reflected since they last changed.
 """
 
 MEMORY = np.dtype(

@@ -27,7 +27,7 @@ FARTHER_OUT_RAD = 0.01
 """How much farther out a joint may move if an earlier run left it beyond its limit [rad]."""
 
 MOST_OUTSIDE_RAD = 0.5
-"""How far beyond its limit a joint may start if an earlier run left it there [rad], since a light arm coasts on."""
+"""How far beyond its limit a joint may start if an earlier run left it there [rad]: a light arm may coast past it."""
 
 LONG_GAP = 3.0
 """If the gap between two samples is longer than this [sample intervals], the motion in between is too uncertain to
@@ -78,7 +78,7 @@ class JointChecks:
         self._check: Callable[..., int] = only_version(_look)
 
     def look(self, state: State, unsure: float) -> int:
-        """Check all joints, none of which has missed this reply or the previous one.
+        """Check all joints; each of them must have replied in this exchange and in the previous one.
 
         Returns FINE, or CHECKS * joint + the number of the failed check for the first joint that fails one; later
         joints are not checked. unsure: excess duration of the exchange [s].

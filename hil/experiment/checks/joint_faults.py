@@ -28,7 +28,7 @@ _FEWEST = 4
 """Minimum number of readings from which to explain how a current differs from its goal."""
 
 Fault = tuple[Cause, str]
-"""The cause, and a sentence whose subject, the joint, is left out."""
+"""The cause, and a sentence that omits its subject, the joint."""
 
 
 class JointFaults:

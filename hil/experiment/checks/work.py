@@ -1,7 +1,7 @@
-"""Check the work of the motors: a motor that only takes energy out of the arm turns against its command.
+"""Check the work of the motors: a motor that only takes energy out of the arm is turning against its command.
 
 Work is checked only without a stabiliser. Without one, the arm starts at a stable rest pose and cannot return more work
-than was put in. A motor that keeps taking work out of it therefore turns the wrong way.
+than was put in. A motor that keeps taking work out of the arm is therefore turning the wrong way.
 
 Part of the compiled loop `joint_checks`; a record of type `MEMORY` holds a joint's state.
 """
@@ -18,7 +18,7 @@ TOLERANCE_RAD = 0.04
 """A motor is considered reversed if the work that it has taken out of the arm, divided by the joint's largest planned
 torque, exceeds this [rad].
 
-Because of delays, this is up to 0.02 rad for a healthy motor, with a heavy arm at 20 Hz.
+Because of delays, a healthy motor reaches up to 0.02 rad, with a heavy arm at 20 Hz.
 """
 
 _OF_OTHERS = 0.5

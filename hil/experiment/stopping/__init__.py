@@ -1,1 +1,1 @@
-"""Stops that leave the arm at rest: a spatial arm is braked, then lowered to its rest pose."""
+"""Stopping a spatial arm so that it ends at rest: it is braked, then lowered to its rest pose."""

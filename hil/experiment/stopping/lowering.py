@@ -1,11 +1,12 @@
-"""Stops an arm that cannot hang freely: brakes it, then lowers it to its rest pose while its servos accept commands.
+"""Stops an arm that cannot hang freely: brakes it, then lowers it to its rest pose for as long as its servos accept
+commands.
 
 The feed-forward torque is combined with the stabiliser's spring and damper, which track the path to the rest pose;
 while a joint is off the path, an additional torque towards the path grows. Lowering is monitored like the experiment;
 torque is also cut if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities that
 agree with the positions.
 
-Replies may be missing for a moment, even at the beginning: joints that are not heard get only the feed-forward torque.
+Replies may be missing for a moment, even at the beginning: joints that do not reply get only the feed-forward torque.
 """
 
 from collections import deque
@@ -54,7 +55,7 @@ _FASTER = 1.3
 
 
 def may_lower(config: Config, error: BaseException) -> bool:
-    """Whether this stop lowers the arm before torque is cut: configuration and cause must both allow it."""
+    """Whether to lower the arm before torque is cut after this error: configuration and cause must both allow it."""
     if not config.is_chain or config.safety.stop == "cut":
         return False
     if not isinstance(error, ExperimentError):
@@ -63,8 +64,8 @@ def may_lower(config: Config, error: BaseException) -> bool:
 
 
 class Lowering:
-    """Computes the goals on the path to the rest pose. Created before torque is switched on; call `begin` when a stop
-    occurs.
+    """Computes the goals on the path to the rest pose. Create it before torque is switched on; call `begin` when the
+    stream is stopped.
 
     interval: time between two exchanges [s]; by default, the sample period.
     """
@@ -269,13 +270,13 @@ class Lowering:
 
 
 def _widened(config: Config, position: np.ndarray, velocity: np.ndarray) -> Config:
-    """Return the limits for lowering, widened just enough for the arm's position and velocity when it was stopped."""
+    """Return the configuration with limits widened for lowering, given the arm's position and velocity when stopped."""
     fastest = max(_FASTER * float(np.abs(velocity).max()), 2.0 * config.safety.lower_speed) + 0.5
     joints = [
         _allowing(joint, float(row.min()), float(row.max()), max(fastest, joint.velocity_limit))
         for joint, row in zip(config.joints, position, strict=True)
     ]
-    # A servo that has only lost its watchdog can still be lowered, which is better than dropping it.
+    # An arm on which a servo has only lost its watchdog can still be lowered, which is better than dropping it.
     unwatched = config.safety.model_copy(update={"allow_no_watchdog": True})
     return config.model_copy(update={"joints": joints, "safety": unwatched})
 

@@ -1,4 +1,4 @@
-"""Exchanges with a spatial arm from the stop until it lies in its rest pose.
+"""Exchanges with a spatial arm from the moment it is stopped until it lies in its rest pose.
 
 `hil.experiment.stopping.lowering` computes the goals and checks the replies; this module sends, receives and records
 them in time.

@@ -26,7 +26,9 @@ NOISE_RAD, LASTS_S = 0.0015, 0.1
 """Lower bound on the standard deviation of `apart` [rad], and correlation time of its errors [s]."""
 
 LEAST_INFORMATION = 0.1
-"""Smallest integral of the squared change of velocity, excluding what a scale error explains [rad^2/s]."""
+"""Smallest integral of the squared change of velocity, excluding what a scale error explains, at which lags are
+compared [rad^2/s].
+"""
 
 ENOUGH_INFORMATION, ALL_INFORMATION = 0.3, 3.0
 """Integrals as in `LEAST_INFORMATION`, but over the whole run: above the first, lag and scale error count as known;

@@ -116,8 +116,8 @@ def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> None:
     Torque that killed runs left on is first switched off on all servos. A servo on which another program has switched
     torque on since is left as it is.
 
-    needed: ID of the servo that the caller needs. say: receives a message for each servo that was or could not be
-    restored. Raises PortLost and, once all other servos have been restored, the error of `recover` for the needed servo
+    needed: ID of the servo that the caller needs. say: receives a message for each servo that was restored or could
+    not be. Raises PortLost and, once all other servos have been restored, the error of `recover` for the needed servo
     if it answers.
     """
     failed: dict[Servo, DriverError] = {}

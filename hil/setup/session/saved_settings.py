@@ -24,7 +24,7 @@ _MOST_CHECKS = 3
 class SavedSettings:
     """The settings to restore. Each servo has a file on disk until its settings have been restored.
 
-    say: receives messages for the user. config: absolute path of the arm's configuration, stated in the files.
+    say: receives messages for the user. config: absolute path of the arm's configuration, recorded in the files.
     """
 
     bus: ServoBus
@@ -129,7 +129,7 @@ class SavedSettings:
             if not differing:
                 return
             clock = self.bus.port.clock
-            clock.wait_until(clock.now() + _REST_S)  # another program that writes now and then, or late replies
+            clock.wait_until(clock.now() + _REST_S)  # for late replies, or another program's occasional writes
             failed |= self.put_back(differing) if attempt < _MOST_CHECKS - 1 else differing
 
     def forget(self, restored: Iterable[Joint]) -> None:

@@ -132,7 +132,7 @@ class ServoSession:
         self.bus.wait_switched_off(self.bus.port.clock.now() + COUNT_DOWN_S)
 
     def end(self) -> list[str]:
-        """Restore every servo's settings; return one message per reason for which some could not be restored.
+        """Restore every servo's settings; return one message for each reason why some could not be restored.
 
         Torque is read last, and cut again if another program has switched it on since; those servos' settings are then
         restored again. Never raises DriverError.
@@ -145,7 +145,7 @@ class ServoSession:
             clock = self.bus.port.clock
             clock.wait_until(clock.now() + REBOOT_S)
             if any(isinstance(error, PortLost) for error in failed.values()):
-                self.bus.port.reopen()  # a hub or an adapter that was reset, by the motors' noise for instance
+                self.bus.port.reopen()  # if a hub or an adapter was reset, for example by electrical noise
             failed = saved.put_back(failed)
         saved.verify(failed)
         left = unrestored(saved, failed, self.settings, self._delays, is_ours=self._is_ours)
@@ -201,7 +201,7 @@ class ServoSession:
             yield (
                 f"Another program switched torque on at {and_list(map(str, off))} before or while the settings were "
                 "restored. It was cut again and was still off when it was last read. End that program before "
-                "you reach into the arm: it may switch torque on again."
+                "you reach into the arm's workspace: it may switch torque on again."
             )
 
 

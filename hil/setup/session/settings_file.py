@@ -3,7 +3,7 @@
 There is one file per servo in the user's state folder, named after port, ID and model. However a program ends, the next
 program on that port finds the file and restores the settings. If the adapter has a serial number, the file is named
 after the adapter instead of the port, whose name may later belong to another arm. Otherwise, the file is also found if
-the port goes by another name: that of a link or of the device itself.
+the port goes by another name: that of a symbolic link or of the device itself.
 """
 
 import json
@@ -28,7 +28,7 @@ _FILE_NAME = re.compile(r".*_ID(\d+)_(.+)\.json", re.ASCII)
 
 
 class DamagedSettings(WrongSetting):
-    """The file with a servo's saved settings is damaged. Example: the disk failed after the program was killed."""
+    """The file with a servo's saved settings is damaged, for example because the disk failed after a run was killed."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def keep(
 def load(port: str, servo_id: int, model: str) -> Kept | None:
     """The settings that an earlier program left for this servo; None if there are none.
 
-    Raises DamagedSettings if this servo's file exists but does not hold them.
+    Raises DamagedSettings if this servo's file exists but holds no valid settings.
     """
     own = settings_path(port, servo_id, model)
     device = _device(port)
@@ -152,7 +152,7 @@ def _has_file(port: str, servo_id: int, model: str) -> bool:
 
 
 def _contents(path: Path) -> bytes | None:
-    """Return the contents of a file, none if they cannot be read; None if there is no such file."""
+    """Return the contents of a file: empty if it cannot be read, None if there is no such file."""
     try:
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):

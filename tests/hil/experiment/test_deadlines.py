@@ -56,7 +56,7 @@ def test_a_sample_on_time_begins_the_row_anew(arm: Arm) -> None:
 def test_what_the_watchdogs_did_during_a_gap(arm: Arm) -> None:
     deadlines = Deadlines(arm())
     deadlines.check_gap(0.0799)
-    acted = "Watchdogs that were still armed had cut the current after 80 ms."
+    acted = "Watchdogs that were still armed cut the current after 80 ms."
     said = said_by(lambda: deadlines.check_gap(0.08))
     assert "This program stalled: 80 ms passed between two commands" in said and said.endswith(acted)
     assert "1.5 s passed" in said_by(lambda: deadlines.check_gap(1.5))

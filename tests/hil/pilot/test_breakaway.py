@@ -289,4 +289,4 @@ def test_an_arm_that_rests_on_a_stop_is_distinguished_from_one_that_friction_hol
     position = motion.rounded().position
     said = resting_on_stop(config, Seen(motion.torque, motion.torque, position, np.array([rest]), position[:, -1]))
     assert said.startswith("Joint 'pendulum'") is rests and bool(said) is rests
-    assert ("rests against something compliant (a stop, a table or a cable) at -0.8" in said) is rests
+    assert ("rests against something compliant (an end stop, a table or a cable) at -0.8" in said) is rests
