@@ -1,1 +1,1 @@
-"""Run an experiment on the bus: stream, guard, stop."""
+"""Run an experiment on the bus: stream goals, check every sample, and stop the arm."""

@@ -332,10 +332,10 @@ class Guard:
             self._stop(
                 index,
                 Cause.MISSING,
-                f"answers with an error ({describe_status_error(error)}) instead of its state; its last state was "
+                f"answers with an error ({describe_status_error(error)}) instead of its state; its last state came "
                 f"{too_long}. It refuses reads: power-cycle it.",
             )
-        what = f"missed {self._missing[index]} replies in a row; its last reply was {too_long}."
+        what = f"missed {self._missing[index]} replies in a row; its last reply came {too_long}."
         if heard := self._heard_instead():
             self._stop(index, Cause.MISSING, f"{what} {heard}")
         unheard = Unheard.ONE if len(self._missing) == 1 or not all(self._missing) else Unheard.ALL

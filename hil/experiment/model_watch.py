@@ -201,8 +201,8 @@ def _watch_loop(
 ) -> int:
     """Process a sample: both checks in one call, since entering compiled code costs as much as a check itself.
 
-    Returns 0, or _JOLTED times the number of the joint that jolted (from 1) plus that of the joint whose motion is
-    inconsistent.
+    Returns 0, or _JOLTED times the number of the joint that jolted (counted from 1) plus that of the joint whose motion
+    is inconsistent.
 
     velocities: the latest ones, as `_jolting` needs them. m, rests, past, k: the observer's arrays. before, after:
     times of the exchange [s].

@@ -51,7 +51,7 @@ _DESCRIBED = (
     "Since the motion had just begun, check first whether the configuration fits the arm: each joint's "
     "direction, id, torque_constant and wiring."
 )
-"""Advice for a stop within `_FIRST_S` [s] of the first goal, unless an earlier run has shown that the arm obeys."""
+"""Advice for a stop within `_FIRST_S` [s] of the first goal, unless an earlier run of this session moved the arm."""
 
 _MOST_UNSEEN = 20
 """Number of progress reports that may be queued for the observer (about one second)."""
@@ -386,7 +386,7 @@ def _positions(config: Config, bus: ServoBus) -> list[float]:
 
 
 def _from_where_it_lies(config: Config, plan: Plan, bus: ServoBus, run: RunFolder, note: Note) -> tuple[Config, Plan]:
-    """Replan a spatial arm's motion if the arm is not exactly in its rest pose; save the change for the estimate."""
+    """Replan a spatial arm's motion if the arm is not exactly in its rest pose; save the change for estimation."""
     lies = from_where_it_lies(config, bus.read_positions())
     if lies is config:
         return config, plan
@@ -406,8 +406,8 @@ def _check_inside(config: Config, bus: ServoBus) -> None:
         low, high = limited.position_limit
         if not low - MOST_OUTSIDE_RAD <= position <= high + MOST_OUTSIDE_RAD:
             raise ExperimentError(
-                f"{joint} is at {position:.3f} rad, where the previous run's stop left it, outside its position limit "
-                f"[{low:g}, {high:g}]. Move it back to arm.rest_pose by hand, then start again."
+                f"{joint} is at {position:.3f} rad, where the stop of the previous run left it, outside its position "
+                f"limit [{low:g}, {high:g}]. Move it back to arm.rest_pose by hand, then start again."
             )
 
 

@@ -1,4 +1,4 @@
-"""Read the servos' own current and PWM limits, compare them with the configuration, lower them, and read them back.
+"""Compare the servos' own current and PWM limits with the configuration, and lower their Current Limit for the run.
 
 A servo with a lowered Current Limit refuses larger goals, even if this program fails. The session restores the limit.
 """

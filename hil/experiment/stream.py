@@ -175,7 +175,7 @@ class Stream:
             raise
 
     def _name_lost_torque(self, error: ExperimentError | BusOverheard) -> None:
-        """Raise SafetyStop instead of `error` if a servo without torque explains it."""
+        """Raise SafetyStop instead of `error` if a servo that has lost its torque explains it."""
         is_explained = isinstance(error, DidNotMove | NotSettled)
         if not is_explained and not (isinstance(error, SafetyStop) and error.cause in _BY_LOST_TORQUE):
             return
@@ -270,9 +270,7 @@ class Stream:
             difference = repetition.difference
             differences.append(difference)
             if difference <= self._plan.settle_within:
-                self._note(
-                    f"{segment.role}: period {period} has settled; it differs from the one before by {difference:.2%}"
-                )
+                self._note(f"{segment.role}: settled; period {period} differs from the one before by {difference:.2%}")
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
                     self._check_motion(repetition.moved)
@@ -336,7 +334,7 @@ class Stream:
         if self._config.is_chain:
             return "raise experiment.rate, so that a stiffer stabiliser can move it, or widen position_limit"
         if self._config.experiment.pilot:  # the pilot chooses the torque
-            return "widen position_limit or raise the lower end of experiment.band, so that more torque is safe"
+            return "widen position_limit or raise the lower limit of experiment.band, so that more torque is safe"
         return "raise experiment.peak_torque"
 
     def _play_period(self, segment: Segment, period: int) -> None:

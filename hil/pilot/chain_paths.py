@@ -104,7 +104,7 @@ class Paths:
         except ExcitationError as error:
             raise NoSafeTorque(
                 f"{config.path}: {error}. Widen position_limit, raise {limit_names(config)}, correct [clearance], or "
-                "give [joint_path] and pilot = false."
+                "set [joint_path] and pilot = false."
             ) from error
         return cls(config, designer, best, other, reserve)
 

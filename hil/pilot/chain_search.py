@@ -1,4 +1,4 @@
-"""From URDF, limits and rest pose to an identified spatial arm: pilot, steps of increasing amplitude, full run.
+"""Identify a spatial arm from its URDF, limits and rest pose, in runs of increasing amplitude.
 
 pilot     a small fraction of the designed path, safe for every arm of the prior ensemble
 steps     larger fractions, safe for the ensemble as updated after each run
@@ -114,7 +114,7 @@ class ChainSearch(SafeShares):
         """Play one step, compare it with the prediction, and update the belief.
 
         name: name of the step for messages. folder: name of its run folder. shares: fractions of the paths' amplitude
-        to try, in this order. Returns the one that was played, with its prediction.
+        to try, in this order. Returns the fraction that was played, with its prediction.
         """
         config = step_config(self.config)
         found = self.safe(config, shares, shares[0] if self.steps else np.inf)
@@ -126,7 +126,7 @@ class ChainSearch(SafeShares):
         return found
 
     def limit_after(self, error: ExperimentError, found: Found) -> None:
-        """Reduce the largest allowed amplitude after a run was stopped, but not if it never settled or a joint stood still."""
+        """Reduce the largest allowed amplitude after a stopped run, unless it never settled or a joint stood still."""
         if not isinstance(error, NotSettled | DidNotMove):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 

@@ -104,7 +104,7 @@ class SafeShares:
     def safe(self, config: Config, shares: tuple[float, ...], most: float = np.inf) -> Found:
         """Find the first of `shares`, fractions of the designed path's amplitude, that is safe for all simulated arms.
 
-        most: largest allowed fraction; if `shares` begin with a larger one, all of them are scaled down in proportion.
+        most: largest allowed fraction; if `shares` begins with a larger one, all of them are scaled down in proportion.
         On other paths, the fraction that gives the same amplitude is used instead.
 
         If the safe fraction is small, other paths with more reserve are designed; the most informative safe one is

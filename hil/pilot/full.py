@@ -1,4 +1,4 @@
-"""From link lengths to the result: the amplitude search, the full run, and its estimate."""
+"""Identification from link lengths alone: the amplitude search, the full run, and its estimate."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -87,7 +87,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
         before, found = found.peak_torque, search.amplitude(config, 1.0, plan)
         how = "less torque" if (found.peak_torque < before).any() else "another waveform"
         within = search.config.experiment.settle_within
-        more = "" if played.passed_limit else f", with settle_within = {within:g} instead of the file's"
+        more = "" if played.passed_limit else f", with settle_within = {within:g} instead of the file's value"
         say(f"Repeating with {how}{more}.")
 
 
@@ -107,7 +107,7 @@ def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -
 
 
 def _faster(config: Config, options: PilotOptions) -> list[float]:
-    """The experiment's band with its lower end raised, as far as `options` allow [Hz]; [] if it cannot be raised.
+    """The experiment's band with its lower limit raised, as far as `options` allow [Hz]; [] if it cannot be raised.
 
     If static friction far exceeds kinetic friction, a torque that moves the joint at low frequencies moves it too far.
     """

@@ -2,7 +2,7 @@
 so much friction that gravity cannot move a joint.
 
 The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction within a radian,
-and soft enough to leave most of the torque to the excitation.
+and soft enough to leave most of the torque for the excitation.
 
 At a low sample rate, the delay of such a spring would drive the joint (`hil.plan.stabiliser`). The damper is then made
 stronger and the spring softer, as far as rate and gravity allow.
@@ -94,7 +94,7 @@ def _at_rate(rate: float, stiffness: Array, damping: Array, usual: Array, lighte
 
 
 def _sufficient_rates(damping: Array, least: Array, usual: Array, lightest: Array) -> Array:
-    """Return each joint's lowest rate (joints,) [Hz] at which `_at_rate` reaches the stiffness that gravity requires."""
+    """Return each joint's lowest rate (joints,) [Hz] at which `_at_rate` gives the stiffness that gravity requires."""
     product = DELAY_SAMPLES * least / _DRIVEN  # of rate and damping
     grown = MOST_DAMPING * lightest  # damping per rate
     root = np.sqrt(usual**2 + 4.0 * grown * product)

@@ -10,26 +10,26 @@ class PilotOptions:
     arms: int = 96
     """Number of arms in the belief's ensemble."""
     pilot_shares: tuple[float, ...] = (0.45, 0.6, 0.75, 0.9)
-    """Fractions of the limits that successive pilots may use; the last value applies to all further pilots."""
+    """Fractions of the limits that successive pilot runs may use; the last value applies to all further ones."""
     pilot_share_known: float = 0.75
-    """Fraction of the limits that the first pilot may use if the belief comes from an earlier result."""
+    """Fraction of the limits that the first pilot run may use if the belief comes from an earlier result."""
     max_steps: int = 12
-    """Maximum number of runs between the last pilot and the full run."""
+    """Maximum number of runs between the last pilot run and the full run."""
     max_pilots: int = 40
-    """Maximum number of pilots; a joint that does not move reaches its current limit in far fewer."""
+    """Maximum number of pilot runs; a joint that does not move reaches its current limit in far fewer."""
     certain_share: float = 0.85
     """Fraction of a limit that a typical arm should reach."""
     certain_share_known: float = 0.68
     """`certain_share` if the belief comes from an earlier result, whose uncertainty another run would hardly reduce."""
 
     pilot_period_share: float = 0.5
-    """Period of a pilot, relative to experiment.period."""
+    """Period of a pilot run, relative to experiment.period."""
     max_pilot_settling: int = 1
-    """Maximum number of settling periods of a pilot or an intermediate run."""
+    """Maximum number of settling periods in a pilot or intermediate run."""
 
     first_torque_share: float = 0.02
-    """Torque of the first pilot, relative to the torque that the current limits allow, if no torque is safe over the
-    whole range of motion.
+    """Torque of the first pilot run, relative to the torque that the current limits allow, if no torque is safe over
+    the whole range of motion.
     """
     breakaway_raise: float = 1.6
     """Ratio of successive peak torques of a joint that has not moved yet."""

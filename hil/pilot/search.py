@@ -1,5 +1,5 @@
-"""From the first careful run to a plan at the limits: run, update the belief, and raise the torque until the belief is
-precise.
+"""The search from the first careful run to a plan that reaches the limits: run, update the belief, and raise the torque
+until the belief is precise.
 
 A run in which nothing moved, a limit was exceeded or the motion never settled is informative too.
 """
@@ -94,7 +94,7 @@ class Search:
         return with_stabiliser(self.config, self.belief, self.springs)
 
     def first_run(self) -> tuple[Config, Amplitude]:
-        """Return the configuration and amplitude of the first run, but do not run it. Raises NoSafeTorque."""
+        """Return the configuration and amplitude of the first run without running it. Raises NoSafeTorque."""
         return self._pilot_amplitude(pilot_config(self.held, self.options), 0)
 
     def find(self) -> tuple[Config, Amplitude]:
@@ -294,7 +294,7 @@ class Search:
 
     def _play(self, config: Config, folder: str, name: str, found: Amplitude) -> None:
         played_config = with_torque(config, found.peak_torque)
-        # The first period is informative even if unsettled; unlike cutting torque, a ramp out lets the arm come to rest.
+        # The first period is informative even if unsettled; a ramp out, unlike cutting torque, lets the arm settle.
         calm = Amplitude(replace(found.plan, settle_within=np.inf), found.peak_torque, found.prediction)
         played = self.play(played_config, self.run.below(folder, played_config), name, calm)
         self.learn(played_config, played)
@@ -370,8 +370,8 @@ def used_range(found: Amplitude) -> Array:
 
 
 def pilot_config(config: Config, options: PilotOptions = DEFAULTS) -> Config:
-    """A pilot's configuration: half the period if the band allows it, no held-out multisine, no waiting for steady
-    state.
+    """The configuration of a pilot run: half the period if the band allows it, no held-out multisine, no waiting for
+    steady state.
     """
     experiment = config.experiment
     update: dict[str, Any] = {"held_out": False, "peak_torque": None, "periods": 1, "warm_up": 0.0}

@@ -95,7 +95,7 @@ def settings_now(bus: ServoBus, before: Settings | None = None) -> Settings:
 
 
 def _confirmed(bus: ServoBus, before: Settings, found: Settings) -> Settings:
-    """Return `found` without the values that differ from `before` and are not read again (`Servo.read_surely`)."""
+    """Return `found` without values that differ from `before` and that `Servo.read_surely` does not confirm."""
     kept = dict(found)
     for (joint, register), value in found.items():
         if before.get((joint, register), value) == value or bus.drives[joint].answered_pings_only:

@@ -135,7 +135,7 @@ def _choose(servos: list[Found], ask: Ask, say: Say) -> list[Found]:
         if 1 <= len(words) <= 2 and len(set(words)) == len(words) and all(_known(word, by_id) for word in words):
             _say_who_is_left_out([each for number, each in by_id.items() if str(number) not in words], say)
             return [by_id[int(word)] for word in words]
-        say(f"{answer!r}: give one or two different IDs out of {', '.join(map(str, by_id))}, for example: {usual}")
+        say(f"{answer!r}: enter one or two different IDs from {', '.join(map(str, by_id))}; for example: {usual}")
 
 
 def _say_who_is_left_out(others: Sequence[Found], say: Say) -> None:
@@ -183,7 +183,7 @@ def _stance(ask: Ask, say: Say) -> str:
         answer = ask(question, HANGING).lower()
         if answer in _REST:
             return answer
-        say(f"{answer!r}: answer {', '.join(_REST)}")
+        say(f"{answer!r}: enter one of {', '.join(_REST)}")
 
 
 def _number(question: str, usual: str, bounds: tuple[float, float], ask: Ask, say: Say) -> float:
@@ -196,4 +196,4 @@ def _number(question: str, usual: str, bounds: tuple[float, float], ask: Ask, sa
             number = math.nan
         if low <= number <= high:
             return number
-        say(f"{answer!r}: give a number from {low:g} to {high:g}")
+        say(f"{answer!r}: enter a number from {low:g} to {high:g}")

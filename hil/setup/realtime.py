@@ -1,4 +1,4 @@
-"""Real-time settings of Linux for the control loop: requested, used if granted, and reported either way.
+"""Linux real-time settings for the control loop: requested, used if granted, and reported either way.
 
 no garbage collection  Python's collector is off inside the loop, and existing objects are frozen
 locked memory          mlockall: no page of this process is swapped in during a cycle

@@ -163,12 +163,12 @@ MEMORY = np.dtype(
 position, velocity, turn: latest values, and latest change of velocity [rad, rad/s]; the position is NaN before the
 first one and after a long gap. unsure: uncertainty of the time of the latest measurement [s]. seconds, moved,
 difference, unknown: sums since the long memory was last updated; most_curved: the maximum since then. seen:
-`difference`, except for motion that is too slow for the velocity register; behind: position minus that of a
-reference that follows such motion [rad]. headed: time of motion in the positive direction minus time of motion in the
-negative direction, since the same update [s]. rough: sum of squares of the errors that velocity jumps may have caused
-since then [rad^2]. heading, roughness, moving: `headed`, `rough` and the time in motion, accumulated in the slow memory
-[s, rad^2, s]. learnt: information from which lag and scale error were estimated [rad^2/s]. lag, scale: their largest
-accepted values [s, 1]. The remaining fields hold the range of the bias and the sums from which lag and scale error are
+`difference`, except for motion that is too slow for the velocity register; behind: position relative to a reference
+that follows such motion [rad]. headed: time of motion in the positive direction minus time of motion in the negative
+direction, since the same update [s]. rough: sum of squares of the errors that velocity jumps may have caused since then
+[rad^2]. heading, roughness, moving: `headed`, `rough` and the time in motion, accumulated in the slow memory [s, rad^2,
+s]. learnt: information from which lag and scale error were estimated [rad^2/s]. lag, scale: their largest accepted
+values [s, 1]. The remaining fields hold the range of the bias and the sums from which lag and scale error are
 estimated.
 """
 

@@ -82,7 +82,7 @@ GOALS = np.dtype(
 )
 """Constant and state of the check for frozen readings of one joint.
 
-most: largest change of the goal under which all readings may stay the same [A or V]. carried, same_for: current, and
+most: largest change of the goal for which all readings may stay the same [A or V]. carried, same_for: current, and
 how long all readings have been the same [s]. age: age of the latest block [s]. low, high: smallest and largest goal in
 each block, the latest first. lowest, highest: smallest upper and largest lower limit of the goal ranges that
 the readings may have reflected since they last changed.

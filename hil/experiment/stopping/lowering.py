@@ -36,7 +36,7 @@ LEAVES_RAD = 0.35
 """Largest accepted tracking error [rad]: a joint with a larger one does not follow its path to the rest pose."""
 
 MOST_PATHS = 4
-"""Maximum number of paths home, including the first: if the arm is pushed off the last one, lowering is abandoned."""
+"""Maximum number of paths to the rest pose: if the arm is pushed off the last one, lowering is abandoned."""
 
 LYING_RAD = 0.06
 """If every joint is within this angle of the rest pose [rad], the arm counts as resting in it."""
@@ -50,7 +50,7 @@ TOO_FAST = 0.6
 """Velocity, relative to the limit, above which torque is cut without a test if a joint seems not to obey its motor."""
 
 _GROWS_S = 0.015
-_ROOM_RAD = 0.2  # beyond the position limits and the path home
+_ROOM_RAD = 0.2  # beyond the position limits and the path to the rest pose
 _FASTER = 1.3
 
 
@@ -146,14 +146,14 @@ class Lowering:
         return count
 
     def begin_again(self, state: State, goal: list[float]) -> int:
-        """Plan another path home from this sample; return its number of samples."""
+        """Plan another path to the rest pose from this sample; return its number of samples."""
         return self._set_out(state, self._believed(state), goal)
 
     def _believed(self, state: State) -> Array:
         return np.array(self._recent.until(state).believed(state))
 
     def _set_out(self, state: State, velocity: Array, goal: list[float]) -> int:
-        """Plan a path home from this sample; return its number of samples."""
+        """Plan a path to the rest pose from this sample; return its number of samples."""
         position = np.array(state.position)
         self._path = self._way.path(position, velocity)
         torque = self._thought.of(self._path)
@@ -213,7 +213,7 @@ class Lowering:
             self._look_at_obedience(index, state)
 
     def _look_at_distance(self, joint: int, away: float) -> None:
-        """Check a joint that is `away` [rad] from its path; if it was pushed, plan a new path home."""
+        """Check a joint that is `away` [rad] from its path; if it was pushed, ask for a new path."""
         pushed = self._obedience.is_pushed(joint)
         self.needs_another_path = pushed and self._paths < MOST_PATHS
         if not self.needs_another_path:

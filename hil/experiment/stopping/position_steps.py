@@ -11,7 +11,7 @@ from hil.drivers.state import State
 __all__ = ["PositionSteps"]
 
 STEP_RAD = 0.04
-"""Smallest step [rad]; smaller ones are left to the feedback."""
+"""Smallest step that is corrected [rad]; the feedback control handles smaller ones."""
 
 BENDS_RAD_S2 = 200.0
 """Largest joint acceleration assumed while an arm is being lowered [rad/s^2]; it sets the uncertainty of predictions.
@@ -39,7 +39,7 @@ class PositionSteps:
         self._steps = [0] * len(self._seen)
 
     def corrected(self, state: State) -> State:
-        """Return a copy of the exchange with positions extrapolated from the motion so far [rad]."""
+        """Return the exchange with all steps removed from its positions."""
         position, at = list(state.position), state.time_before_write
         for joint, is_missing in enumerate(state.missing):
             if not is_missing:

@@ -128,7 +128,7 @@ class WayDown:
         return not all(latest.missing) or (len(latest.missing) > 1 and self._bus.first_hides_others(LONGER_S))
 
     def _follow(self, state: State, stopped: Stopped) -> State:
-        """Follow the path home; return the last state. Raises SafetyStop, StopRequested, DriverError."""
+        """Follow the path to the rest pose; return the last state. Raises SafetyStop, StopRequested, DriverError."""
         lowering, asked = self._lowering, max(1, self._stop.count)
         self._bus.bear_others()
         self._bus.prepared.accept_any_order()
