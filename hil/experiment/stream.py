@@ -138,7 +138,7 @@ class Stream:
         """The latest state with replies from all servos."""
         self._sampled: State | None = None
         self._is_undriven = True
-        """Whether nothing has driven the arm yet; a stabiliser cannot drive it before the first sample."""
+        """Whether the arm has not been driven yet; a stabiliser cannot drive it before the first sample."""
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
         self._repetition = Repetition(longest, len(bus.joints), self._pace.interval)

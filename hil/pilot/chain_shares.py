@@ -35,7 +35,7 @@ SMALL = 0.5
 REDESIGNS = 2
 
 OTHER_SEEDS = 2
-"""Number of paths designed from other seeds if a path is not safe at any amplitude."""
+"""Maximum number of paths designed from other seeds if a path is not safe at any amplitude."""
 
 _NEXT_SEED = 100
 

@@ -1,4 +1,4 @@
-"""Repeat runs that were stopped because this computer was late: such runs reveal nothing about the arm."""
+"""Repeat runs that were stopped because this computer missed deadlines: they reveal nothing about the arm."""
 
 from collections.abc import Callable
 

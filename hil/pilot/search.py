@@ -274,7 +274,7 @@ class Search:
             is_fair = self._shares(found).min() > options.fair_share
             worthwhile = options.worthwhile_raise if is_fair else options.worthwhile_raise_far
             if (found.peak_torque <= worthwhile * former).all():
-                break  # the updated belief allows hardly more torque
+                break  # the updated belief allows hardly any more torque
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:

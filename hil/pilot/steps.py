@@ -117,7 +117,7 @@ class Player:
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude, arms: Ensemble) -> Played:
         """Play one run on an arm that could be any of `arms`, compare it with the prediction, and report.
 
-        A run that is stopped because this computer was late is repeated. Raises the same errors as a run, except those
+        A run that is stopped because of missed deadlines is repeated. Raises the same errors as a run, except those
         that are informative about the arm (`tells_of_the_arm`).
         """
         torque, error = "", None

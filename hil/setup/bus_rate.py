@@ -92,7 +92,7 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
     """Measure every exchange mode, and check whether the configured one sustains `wanted` [Hz]; see `measure_modes`."""
     modes = measure_modes(bus)
     if _configured(bus, modes).rate < wanted:
-        # A busy computer delays exchanges for a while, a slow bus always.
+        # A busy computer delays exchanges for a while, a slow bus delays them always.
         bus.port.clock.wait_until(bus.port.clock.now() + AGAIN_AFTER_S)
         modes = [_faster(*pair) for pair in zip(modes, measure_modes(bus), strict=True)]
     used = _configured(bus, modes)

@@ -88,7 +88,7 @@ def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Arr
     angles = tuple(change.tolist())
     if abs(change[most]) < MOVED:
         found = (
-            f"{joint.name!r} did not move: does ID {joint.id} belong to its servo? If a joint that is not in "
+            f"{joint.name!r} did not move: is {joint.id} the ID of its servo? If a joint that is not in "
             "[[joints]] moved instead, the IDs are wrong"
         )
         return Moved(joint.name, asked, angles, False, found)

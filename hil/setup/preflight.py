@@ -1,4 +1,4 @@
-"""Check for anything that would stop an experiment, and state how to fix it. Torque stays off."""
+"""Check for anything that would prevent or stop an experiment, and state how to fix it. Torque stays off."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ _LONG_RETURN_DELAY_US = 20
 
 
 class Level(StrEnum):
-    """Severity: OK, WARNING (does not stop the experiment) or STOP (stops it)."""
+    """Severity: OK, WARNING (the experiment can still start) or STOP (it cannot)."""
 
     OK = "ok"
     WARNING = "warning"

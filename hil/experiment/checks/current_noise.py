@@ -55,7 +55,7 @@ class CurrentNoise:
             return False
         self._errors.append(state.current - goal)
         count = len(self._errors)
-        # Each measurement needs twice as many readings as the one before: this takes time between two samples.
+        # Measure only once the number of readings has doubled, since this takes time between two samples.
         return FEWEST_READINGS <= count < MOST_READINGS and count & (count - 1) == 0
 
     def measured(self) -> tuple[list[float], list[float]]:

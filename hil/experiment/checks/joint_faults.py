@@ -140,7 +140,7 @@ class JointFaults:
         if has_own_goal and model and model.is_out_of_voltage(commanded, carried, velocity):
             if model.is_out_of_voltage(commanded, carried, velocity, self.supply[index]):
                 return self._out_of_voltage(index, commanded, carried, velocity)
-            # Published figures are too uncertain to rule the supply out: the arm is braked all the same.
+            # Published figures are too uncertain to rule out the supply, so the arm is still braked.
             return (
                 Cause.GOALS_CHANGED,
                 f"{said} at {velocity:.2f} rad/s: {self.supply[index]:.1f} V would drive the commanded current at "

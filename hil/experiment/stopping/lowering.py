@@ -179,11 +179,11 @@ class Lowering:
         return int(count)
 
     def check_time(self, seconds: float) -> None:
-        """Raise SafetyStop if lowering would take too long: `seconds` [s] in all."""
+        """Raise SafetyStop if lowering would take too long: `seconds` [s] in total."""
         longest = self._config.safety.lower_time
         if seconds > longest:
             raise SafetyStop(
-                f"the arm was pushed off its path. With a new path, lowering would take {seconds:.1f} s in all; "
+                f"the arm was pushed off its path. With a new path, lowering would take {seconds:.1f} s in total; "
                 f"safety.lower_time allows {longest:g} s.",
                 Cause.UNEXPECTED,
             )

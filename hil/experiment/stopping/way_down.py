@@ -139,7 +139,7 @@ class WayDown:
         index = first = round(old / self._interval)
         self._steps = PositionSteps(state)
         count = lowering.begin(state, self._goal, self._guard.recent, self._watch, self._guard.current_noise)
-        # The first goals are sent at once: until then those that led to the stop drive the arm.
+        # The first goals are sent at once: until then, those that led to the stop drive the arm.
         begun = start = self._clock.now() - first * self._interval
         while index < count:
             if lowering.needs_another_path:

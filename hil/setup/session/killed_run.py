@@ -1,7 +1,7 @@
 """Settings that a killed program left on the servos.
 
 If a register holds neither the value that the killed program set nor the earlier one, another program has changed it.
-It is reported but not restored, since the user may have wanted the change.
+Such a register is reported but not restored, since the user may have wanted the change.
 """
 
 from collections.abc import Mapping

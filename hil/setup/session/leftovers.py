@@ -28,7 +28,7 @@ class Leftovers:
     """What a killed run left on one servo.
 
     told: sentences about the run, what differs and the file with the former settings. restore: the command that
-    restores the servo; "" if none can. trouble: a short description.
+    restores the servo; "" if none can. trouble: a short description of the problem.
     """
 
     told: str

@@ -40,7 +40,7 @@ def change(**by: float) -> np.ndarray:
         (change(elbow=0.4), True, "'elbow' moved by +0.40 rad, as described"),
         (change(elbow=-0.4), False, "set direction = -1"),
         (change(shoulder=0.4), False, "'shoulder' (ID 2) moved by +0.40 rad instead: swap the ids"),
-        (change(elbow=0.02), False, "'elbow' did not move: does ID 3 belong to its servo?"),
+        (change(elbow=0.02), False, "'elbow' did not move: is 3 the ID of its servo?"),
         (change(elbow=0.4, wrist_angle=0.3), True, "wrist_angle moved with it"),
     ],
 )
