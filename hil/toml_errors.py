@@ -213,7 +213,7 @@ def meant_name(given: str, names: Sequence[str]) -> str:
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
     bare = re.sub(r"[^a-z0-9]", "", given.lower())
     long = [name for name in plain if len(name) > 4]
-    # With two wrong characters, a servo's name is another's: XC430-W240 is not XM430-W210.
+    # Two wrong characters can turn one servo's name into another's: XC430-W240 is not XM430-W210.
     cutoff = 0.85 if any(each.isdigit() for each in bare) else 0.75
     near = [bare] if bare in plain else difflib.get_close_matches(bare, long, n=1, cutoff=cutoff)
     return plain[near[0]] if near else ""
@@ -268,7 +268,7 @@ def _table(location: Sequence[str | int], root: type[BaseModel]) -> Any:
     keys = [place for place, part in enumerate(location) if isinstance(part, str) and not part.startswith(UNSAID)]
     last = max(keys, default=0)
     model: Any = root
-    free = False  # whether the next part is a key of the user's own
+    free = False  # whether the next part is a key chosen by the user
     for part in location[:last]:
         if not isinstance(part, str) or part.startswith(UNSAID):
             continue

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 MOST_JOINTS = 7
 POSITION_RESERVE = 0.08
-"""Fraction of a joint's position_limit that a designed path leaves free at either end."""
+"""Fraction of a joint's position range that a designed path leaves free at each end."""
 
 DEFAULT_BAND = (0.1, 1.5)
 """Default frequency band of the excitation in a spatial arm's pilot [Hz]."""
 
 _MOST_TURNED_RAD = 4.5 * math.pi
 _SAME_GRAVITY = 0.1  # m/s^2
-_HARMONICS = 2  # of a path, at least
+_HARMONICS = 2  # minimum for a path
 _PLANAR = 2
 _WIDER_RAD = 1e-3
 _OPTIONS = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
@@ -59,7 +59,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
         where = f'{arm.path.name}: the limits of joint "{joint.name}" are [{lower:g}, {upper:g}] rad'
         if lower >= upper:
             wrong = ", but they are equal" if lower == upper else ", but the lower limit must come first"
-            yield f"{where}{wrong}. They are ignored; correct them."
+            yield f"{where}{wrong}. These limits are ignored; correct them."
             continue
         if max(-lower, upper) > _MOST_TURNED_RAD:
             in_rad = f"[{math.radians(lower):.3g}, {math.radians(upper):.3g}]"
@@ -76,7 +76,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
             shown = f"position_limit = [{joint.position_limit[0]:g}, {joint.position_limit[1]:g}]"
             yield (
                 f"{where}, but {key} lets it move from {low:.3g} to {high:.3g} rad ({shown}): it may run into its "
-                f"stops. Narrow {key}, or correct the limits."
+                f"end stops. Narrow {key}, or correct the limits."
             )
 
 
@@ -188,7 +188,7 @@ def _planar_slips(config: "Config") -> Iterator[str]:
     if config.arm.urdf is None and config.joint_path is not None:
         yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
     if config.model.base_tilt:
-        yield "model.base_tilt: tilting a planar arm acts like a shifted zero of its first joint: use model.zeros"
+        yield "model.base_tilt: tilting a planar arm has the same effect as a zero error of joint 1: use model.zeros"
 
 
 def _path_slips(config: "Config") -> Iterator[str]:
@@ -224,7 +224,7 @@ def _path_slips(config: "Config") -> Iterator[str]:
 
 
 def _changed(path: str) -> float:
-    """The file's modification time [s], so that a changed file is read again."""
+    """The file's modification time [s]; the file is read again when this changes."""
     try:
         return Path(path).stat().st_mtime
     except OSError:

@@ -24,7 +24,7 @@ class JointConfig(Table):
     zero_ticks: int = Field(
         ge=-1_048_575,
         le=1_048_575,
-        description="Present Position where the angle is zero",
+        description="Present Position at which the angle is zero",
     )
     mode: Literal["current", "pwm"] | None = Field(None, description="default: current if the servo model supports it")
     torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")

@@ -327,7 +327,7 @@ def _rigid(
 
 
 def _own(link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: set[str]) -> Iterator[tuple[str, Body]]:
-    """Yield a link and all links attached to it by any joint, each with its own body in the frame of the first."""
+    """Yield a link and all links attached to it by any joint, each with its own body in the frame of the first link."""
     yield link, bodies[link]
     for joint in tree.values():
         if joint.parent == link and joint.name not in chosen:

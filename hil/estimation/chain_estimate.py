@@ -62,7 +62,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     beyond = None
     if HELD_OUT in facts.segments:
-        with suppress(RecordingCutShort):  # stopped in the held-out part: what was finished is estimated
+        with suppress(RecordingCutShort):  # the run ended in the held-out part: use what is complete
             other = settled_period(config, facts, samples, HELD_OUT)
             predicted = predict(model, estimate.parameters, other)
             played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
@@ -264,7 +264,7 @@ def about_zeros(config: Config, estimate: ChainEstimate) -> str:
     if not estimate.doubtful_zeros:
         return (
             f"{held}: a zero error that this motion does not reveal makes the link parameters wrong, although the "
-            "torques are right. Use `hil pose` to check the angles by hand."
+            "torques are correct. Use `hil pose` to check the angles by hand."
         )
     off = ", ".join(
         f"{config.joints[joint - 1].name} is off by about {by:.2g} rad" for joint, by in estimate.doubtful_zeros

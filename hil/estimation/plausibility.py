@@ -20,8 +20,9 @@ _UPRIGHT = 0.5  # sine of a link's angle above the horizontal
 FLAT = 0.02  # of the largest commanded torque, below which gravity counts as absent
 
 MOSTLY_BORROWED, CLEARLY_WIDER = 0.85, 2.0
-"""Standard error of the length of link 1 that follows from the parameters, relative to that of its prior, from which
-the prior is its main source, and from which it must have been widened (`LEVER_DOUBTED`).
+"""Limits on the standard error of the length of link 1 that follows from the parameters, relative to that of its prior.
+Above the first, the length comes mainly from the prior; above the second, the prior must have been widened
+(`LEVER_DOUBTED`).
 """
 
 

@@ -89,8 +89,8 @@ def contradictions(
     source: Source,
     known: Sequence[Conflict] = (),
 ) -> tuple[str, ...]:
-    """A sentence for each joint whose torque is inconsistent with the first joint's by more than the uncertainty of the
-    torque constants.
+    """A sentence for each joint whose torque disagrees with the first joint's by more than the uncertainty of the
+    torque constants allows.
 
     joints: names. extra: terms of a result that include the ratios, if there are any. ratio_std: relative standard
     deviation of the ratio of the torque constants, by parameter; where it is not given, the spread among servos of one

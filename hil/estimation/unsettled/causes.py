@@ -23,7 +23,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.selection.verdict import MUCH_LEFT
 
-CHANGES = ("step", "linear", "decay")  # courses of defects within a recording
+CHANGES = ("step", "linear", "decay")  # time courses of defects within a recording
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def are_known(fitted: Fitted, found: tuple[str, ...]) -> bool:
 
 
 def _stopped_or_clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Sentences about a stop or about clipped torques, whichever leaves less of the torque unexplained."""
+    """Sentences about an end stop or about clipped torques, whichever leaves less of the torque unexplained."""
     stop, clipped = suspect_stop(recordings), suspect_clipped(recordings)
     if stop is None or any(each.residual < stop.residual for each in clipped if each.joint == stop.joint):
         return _clipped(recordings, clipped)
@@ -78,7 +78,7 @@ def _stopped_or_clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
 
 
 def stop_in(recordings: Sequence[Recording]) -> str:
-    """Return a sentence about a joint that seems to press against a stop; "" if there is none."""
+    """Return a sentence about a joint that seems to press against an end stop; "" if there is none."""
     stop = suspect_stop(recordings)
     return "" if stop is None else _stop_said(stop)
 
@@ -86,8 +86,8 @@ def stop_in(recordings: Sequence[Recording]) -> str:
 def _stop_said(stop: Stop) -> str:
     than, stiffness = "above" if stop.side > 0 else "below", float(f"{stop.stiffness:.2g}")
     return (
-        f"Joint {stop.joint} seems to press against something that yields (a stop, a cable or an object) {than} about "
-        f"{stop.at:.3g} rad: with a stiffness of {stiffness:g} N m/rad there, "
+        f"Joint {stop.joint} seems to press against something that yields (an end stop, a cable or an object) {than} "
+        f"about {stop.at:.3g} rad: with a stiffness of {stiffness:g} N m/rad there, "
         f"{unexplained(stop.residual, stop.residual_given)}. Record a motion that does not reach that angle."
     )
 

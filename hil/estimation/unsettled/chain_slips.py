@@ -8,7 +8,7 @@ from hil.estimation.unsettled.slips import reversal_said, unexplained
 from hil.estimator.chain.column_faults import ColumnCheck
 from hil.results.parts import Quantity
 
-ROUGHLY = 0.05  # assumed relative standard error of a ratio of torques that a regression gives
+ROUGHLY = 0.05  # assumed relative standard error of a ratio of torques obtained by regression
 
 
 def refuse_chain_slips(check: ColumnCheck | None, joints: Sequence[str], source: str) -> None:

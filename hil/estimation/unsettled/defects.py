@@ -94,7 +94,7 @@ def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> t
     percent = " and ".join(f"{100.0 * change:+.2g} %" for change in each)
     match hypothesis.course.kind:
         case "decay":
-            said = f"The friction of {whose} seems to begin {percent} off its final value and to settle {when}"
+            said = f"The friction of {whose} seems to start {percent} from its final value and to settle {when}"
             return said, "Let the arm move for some minutes before you record, so that it is warm."
         case "linear":
             said = f"The friction of {whose} seems to change {when}, by {percent} of its initial value"

@@ -15,10 +15,10 @@ from hil.estimator.selection.verdict import MUCH_LEFT
 LEAST_SWING = 30.0  # encoder steps
 LOST = 0.01  # fraction of the samples
 MANY_TURNS = 2.0
-FLAT = 0.05  # fraction of samples at the largest torque; a sine has fewer
+FLAT = 0.05  # fraction of samples at the largest torque; a sine wave has fewer
 LEFT = 0.1  # RMS residual relative to the motion's RMS
-CERTAIN, LEAST_EARLY = 4.0, 0.1  # standard errors and sampling intervals by which a delay is negative
-EQUAL, MOSTLY = 0.1, 0.9  # deviation from a whole number of intervals; fraction of the steps that are so equal
+CERTAIN, LEAST_EARLY = 4.0, 0.1  # least negative delay that is reported, in standard errors and sampling intervals
+EQUAL, MOSTLY = 0.1, 0.9  # deviation of a step from a whole number of intervals; fraction of steps below it
 WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
 
 UNITS_ADVICE = "check the units, signs and zero of position and torque; then try shorter segments"
@@ -32,7 +32,7 @@ class Doubts:
     doubts: tuple[str, ...]
     warnings: tuple[str, ...]
     reason: str = ""
-    """The faults in short, worded as the end of a sentence."""
+    """The faults in brief, phrased as the end of a sentence."""
 
 
 def doubts_of(
