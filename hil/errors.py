@@ -47,7 +47,7 @@ __all__ = [
 
 
 class Cause(Enum):
-    """What the guard detected. If measurement and drive still work, the stop can begin with braking."""
+    """What the guard detected. If the measurements and the drive still work, the arm can be braked first."""
 
     POSITION = "position limit"
     VELOCITY = "velocity limit"

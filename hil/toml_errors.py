@@ -122,7 +122,7 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
 
 
 def what_is_wrong(detail: Any) -> str:
-    """Say what a value must be, given one of pydantic's errors."""
+    """State the requirement that a value violates, given one of pydantic's errors."""
     kind, value = detail["type"], detail["input"]
     if kind in _BOUNDS and str(value).lower() in ("nan", "inf", "-inf"):
         kind = "finite_number"
@@ -130,7 +130,7 @@ def what_is_wrong(detail: Any) -> str:
 
 
 def _exact_length(detail: Any, root: type[BaseModel]) -> str:
-    """Say how many entries a list must have if it is too short or too long and only one length is allowed."""
+    """State the length that a list must have if it is too short or too long and only one length is allowed."""
     if detail["type"] not in {"too_short", "too_long"}:
         return ""
     field = _field_of(detail, root)

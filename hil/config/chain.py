@@ -53,7 +53,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
     arm = described_arm(config)
     wanted = config.joint_path
     for index, (joint, described) in enumerate(zip(config.joints, arm.joints, strict=True)):
-        if described.limits is None or described.limits == (0.0, 0.0):  # the latter means that limits are missing
+        if described.limits is None or described.limits == (0.0, 0.0):  # (0, 0) means that limits are missing
             continue
         lower, upper = described.limits
         where = f'{arm.path.name}: the limits of joint "{joint.name}" are [{lower:g}, {upper:g}] rad'
@@ -93,7 +93,7 @@ def doubted_gravity(config: "Config") -> Iterator[str]:
 
 
 def _mounted(gravity: Array) -> str:
-    """Say which settings give this gravity in the frame of the base (3,) [m/s^2]."""
+    """Explain which settings produce this gravity in the frame of the base (3,) [m/s^2]."""
     strength = float(np.linalg.norm(gravity))
     if strength <= _SAME_GRAVITY:
         return "The file sets gravity to zero: correct it."
@@ -124,7 +124,7 @@ def describes_planar(config: "Config") -> bool:
 
 
 def only_planar(config: "Config", what: str) -> None:
-    """Raise ConfigError if the arm is spatial, because `what` needs a planar arm."""
+    """Raise ConfigError if the arm is spatial. The message says that `what` supports only planar arms."""
     if config.is_chain:
         raise ConfigError(
             f"{config.path}: {what} supports only planar arms so far; this one has arm.urdf. For spatial arms, use "

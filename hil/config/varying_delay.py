@@ -24,7 +24,7 @@ _CHOICES = (20, 25, 40, 50, 100, 125, 200, 250, 500, 1000)
 
 
 def varying_delay(config: "Config") -> str:
-    """Return a sentence about a slow beat between sample rate and control loops; "" if there is none."""
+    """Return a sentence about a slow beat between the sample rate and the control loops; "" if there is none."""
     if all(joint.drive_mode is not Mode.PWM for joint in config.joints):
         return ""
     rate = config.experiment.rate

@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 class ArmFileError(ValueError):
-    """Raised when a file cannot be read or does not describe a serial arm; the message names file and element."""
+    """Raised if a file cannot be read or does not describe a serial arm; the message names the file and the element."""
 
 
 @dataclass(frozen=True)

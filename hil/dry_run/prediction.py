@@ -1,8 +1,8 @@
 """Simulate the experiment on an ensemble of arms, and compare the predicted peaks with each limit.
 
 Every arm receives the plan's goal currents, including the ramps, rounded to the servos' ticks, for as many periods as
-it takes to settle. Peaks are fractions of the distance from rest to the limit; the guard would have stopped an arm
-whose peak reaches 1.
+it takes to settle. Peaks are fractions of the distance from rest to the limit; the guard would stop an arm whose
+peak reaches 1.
 """
 
 from collections.abc import Sequence

@@ -62,7 +62,7 @@ def planned_paths(plan: Plan) -> list[Array]:
 
 
 def said_of_stops(config: Config, side: Array) -> str:
-    """Say which joints are assumed to rest against their end stops, and what happens if they do not; "" if none."""
+    """Name the joints assumed to rest against end stops, and say what happens if they do not; "" if there are none."""
     found = []
     for joint, each, rest in zip(config.joints, side.tolist(), config.arm.rest_pose, strict=True):
         if each:

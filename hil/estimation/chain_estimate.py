@@ -214,14 +214,15 @@ def _verdict(
     if still:
         trust = "no"
         sentences.append(
-            f"{', '.join(still)} hardly moved, so the recording says little about their inertia and friction: increase "
-            "joint_path.swing and speed, and check that nothing blocks the motion."
+            f"{', '.join(still)} hardly moved, so the recording reveals little about their inertia and friction: "
+            "increase joint_path.swing and speed, and check that nothing blocks the motion."
         )
     if estimate.from_prior:
         trust = lowered(trust, "with care")
         sentences.append(
-            f"The recording says little about {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
-            "wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
+            f"The recording reveals little about {', '.join(estimate.from_prior)}: these values come from the URDF. "
+            "Use wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the "
+            "motion."
         )
     if said := vague(known.prior, known.base.names, estimate.std, estimate.from_prior):
         trust = lowered(trust, "with care")

@@ -77,8 +77,8 @@ def _seen_length(gravity: float, estimate: Estimate | ShootingEstimate) -> tuple
 
 
 def borrowed_length(config: Config, estimate: Estimate) -> tuple[str, ...]:
-    """Say so if the coupling is known mainly from `arm.link_lengths`, or if the motion contradicts that length but
-    hardly determines it.
+    """Return a sentence if the coupling is known mainly from `arm.link_lengths`, or if the motion contradicts that
+    length but hardly determines it.
     """
     seen = _seen_length(config.arm.gravity, estimate)
     if estimate.model.lever is None or config.arm.link_lengths is None or seen is None:

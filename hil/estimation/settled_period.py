@@ -143,7 +143,7 @@ def scatter(position: Array) -> Array | None:
     seen = np.isfinite(position).sum(axis=0)
     mean = np.nansum(position, axis=0) / np.maximum(seen, 1)
     squares = np.nansum((position - mean) ** 2, axis=0)
-    # Samples received in only one period, or in none, say nothing about the scatter.
+    # Samples received in only one period, or in none, reveal nothing about the scatter.
     several = seen > 1
     variance = np.where(several, squares / np.maximum(seen - 1, 1), 0.0).sum(axis=1)
     std: Array = np.sqrt(variance / np.maximum(several.sum(axis=1), 1) / count)

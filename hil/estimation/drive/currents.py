@@ -15,7 +15,7 @@ from hil.estimator.arrays import Array, Mask
 from hil.runs.recording import Phase
 
 LARGE = 0.5
-"""Goals above this fraction of the largest one count as large; smaller ones say little about clipping."""
+"""Goals above this fraction of the largest one count as large; smaller ones reveal little about clipping."""
 
 SHORT = 0.85
 """A current counts as clipped if it is below this fraction of the commanded one."""

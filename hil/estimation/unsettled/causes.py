@@ -120,8 +120,8 @@ def _late(recordings: Sequence[Recording]) -> tuple[str, ...]:
     than = "late" if late.delay > 0.0 else "early"
     return (
         f"The torque of joint {late.joint} seems to be logged about {1e3 * abs(late.delay):.2g} ms too {than}, "
-        f"compared with the other joint: allowing for this, inverse dynamics leaves {100 * late.residual:.2g} % of the "
-        f"torque unexplained instead of {100 * late.residual_given:.2g} %. Shift its column, or log both "
+        f"compared with the other joint: with this corrected, inverse dynamics leaves {100 * late.residual:.2g} % of "
+        f"the torque unexplained instead of {100 * late.residual_given:.2g} %. Shift its column, or log both "
         "torques at the same time.",
     )
 
@@ -145,7 +145,7 @@ def _drifting(recordings: Sequence[Recording]) -> tuple[str, ...]:
         return ()
     return (
         f"The delay of the torque drifts from {1e3 * drift.start:+.3g} ms to {1e3 * drift.end:+.3g} ms over the "
-        f"recording ({1e6 * drift.relative:+.0f} ppm): allowing for this, "
+        f"recording ({1e6 * drift.relative:+.0f} ppm): with this corrected, "
         f"{unexplained(drift.residual, drift.residual_given)}. Torque and position were timed by different "
         "clocks: correct the times of one, or log both with the same clock.",
     )

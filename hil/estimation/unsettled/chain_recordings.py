@@ -238,7 +238,7 @@ def _verdict(
     if found.from_prior:
         trust = lowered(trust, "with care")
         sentences.append(
-            f"The recordings say little about {', '.join(found.from_prior)}: these values come from the URDF."
+            f"The recordings reveal little about {', '.join(found.from_prior)}: these values come from the URDF."
         )
     if said := vague(prior, names, found.std, found.from_prior):
         trust = lowered(trust, "with care")

@@ -45,7 +45,7 @@ def late_torque(check: ColumnCheck | None, joints: Sequence[str], fitted: bool) 
     whose = "All torques seem" if late.joint is None else f"The torque of {joints[late.joint]} seems"
     direction = "late" if late.seconds > 0.0 else "early"
     return (
-        f"{whose} to be logged about {1e3 * abs(late.seconds):.0f} ms too {direction}: allowing for this, "
+        f"{whose} to be logged about {1e3 * abs(late.seconds):.0f} ms too {direction}: with this corrected, "
         f"{unexplained(*late.residuals)}. Shift the column in the file; a filter can also cause such a delay.",
     )
 

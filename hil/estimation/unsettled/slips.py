@@ -107,7 +107,7 @@ def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequenc
 
 
 def reversal_said(signs: Signs, joints: Sequence[str] = ()) -> str:
-    """Say which signs are reversed; the caller appends the effect of a correction. joints: names; default: numbers."""
+    """Name the reversed signs; the caller appends the effect of a correction. joints: names; default: numbers."""
     if signs.are_several:
         return f"{signs.said(joints)} are reversed: with these signs changed"
     return f"{signs.said(joints)} is reversed: with the sign changed"
@@ -118,7 +118,7 @@ def _is_clear(residual: float, given: float) -> bool:
 
 
 def unexplained(residual: float, given: float) -> str:
-    """Say how much of the torque inverse dynamics leaves unexplained with a correction, and how much without it."""
+    """State how much of the torque inverse dynamics leaves unexplained with a correction, and how much without it."""
     return f"inverse dynamics leaves {_percent(residual)} of the torque unexplained instead of {_percent(given)}"
 
 
