@@ -207,8 +207,8 @@ def _meant(value: object, expected: str) -> str:
 
 
 def meant_name(given: str, names: Sequence[str]) -> str:
-    """Return the name that was meant: one that differs only in case, spaces and dashes, or the most similar one; "" if
-    none is similar. Short names never count as similar: grad is not rad.
+    """Return the name that was meant: one that differs only in case, spaces and dashes, or else the most similar one;
+    "" if none is similar. Short names are never considered similar: grad is not rad.
     """
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
     bare = re.sub(r"[^a-z0-9]", "", given.lower())
@@ -231,7 +231,7 @@ def _in_thousands(expected: str, value: object) -> str:
 
 
 def _bound(value: float) -> str:
-    """Write 12.566370614359172 as 12.57 and leave 100, 0.05 and whole numbers as they are."""
+    """Write 12.566370614359172 as 12.57 and leave 100, 0.05 and whole numbers unchanged."""
     return f"{value:.4g}" if isinstance(value, float) and len(str(value)) > 9 else str(value)
 
 

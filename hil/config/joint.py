@@ -19,7 +19,9 @@ class JointConfig(Table):
     servos: OneOrList[BusId] = Field(alias="id", description="bus ID, or the IDs of the joint's two servos")
     model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
     turns: OneOrList[Literal[-1, 1]] = Field(
-        1, alias="direction", description="-1 where the servo turns opposite to the joint; one entry per servo"
+        1,
+        alias="direction",
+        description="-1 if the servo turns in the opposite direction to the joint; one entry per servo",
     )
     zero_ticks: int = Field(
         ge=-1_048_575,
@@ -40,7 +42,7 @@ class JointConfig(Table):
     @classmethod
     def _of_the_first_servo(cls, ticks: object) -> object:
         if isinstance(ticks, list):
-            raise ValueError("it must be one whole number; for two servos, give the first servo's")  # noqa: TRY004  pydantic's
+            raise ValueError("it must be one whole number; for two servos, give the first servo's value")  # noqa: TRY004  pydantic's
         return ticks
 
     @field_validator("turns", mode="before")

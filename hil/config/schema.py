@@ -437,7 +437,7 @@ def port_url(port: str) -> str:
 
 
 def _is_only_fake(path: Path) -> bool:
-    """Whether a TOML file describes only a fake arm, which `hil fake` accepts."""
+    """Whether a TOML file describes only a fake arm; `hil fake` accepts such a file."""
     try:
         values = load_toml(path)
     except TomlFileError:

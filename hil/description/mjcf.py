@@ -63,8 +63,8 @@ def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
 class Geom:
     """A shape of an MJCF file, in the frame of its moving link.
 
-    link: 0 for whatever is fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh". size: as in
-    MuJoCo, the half edge lengths of a box, or the radius and, except for a sphere, the half length [m]; for a mesh, the
+    link: its number; 0 for shapes fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh". size: as
+    in MuJoCo, the half edge lengths of a box, or the radius and, except for a sphere, the half length [m]; for a mesh, the
     half edge lengths of its bounding box. Any other shape is treated as a mesh.
     """
 
@@ -237,7 +237,7 @@ class _Tree:
         self, body: int, rotation: Array, translation: Array, number: dict[int, int]
     ) -> tuple[int, Array, Array]:
         """The number of the moving link to which a body is fixed, and a pose converted from the body's frame to that
-        link's.
+        link's frame.
         """
         while body != WORLD and body not in number:
             turn, place = self._placed(body)

@@ -46,8 +46,8 @@ class Prediction:
     same values as fractions of the distance from rest to the limit. limits: limits (quantities, joints). settled_after:
     number of periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over
     time of a few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: sampling
-    rate [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at rest or centre,
-    whichever is farther from that limit.
+    rate [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit are then measured from `rest`
+    or `centre`, whichever is farther from that limit.
     """
 
     values: Array

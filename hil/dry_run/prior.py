@@ -38,7 +38,7 @@ class Quantity:
     spread: Array
 
     def draw(self, random: np.random.Generator, count: int) -> Array:
-        """`count` draws (count, joints), log-normal with median `value`."""
+        """Draw `count` samples (count, joints) from log-normal distributions with median `value`."""
         log_spread = np.sqrt(np.log1p(self.spread**2))
         drawn: Array = self.value * np.exp(log_spread * random.standard_normal((count, self.value.size)))
         return drawn

@@ -60,7 +60,7 @@ def wrong_length(length: float | None, gravity: float, estimate: Estimate | Shoo
 
 
 def _seen_length(gravity: float, estimate: Estimate | ShootingEstimate) -> tuple[float, float] | None:
-    """Length of link 1 that follows from the parameters, with its standard error [m]; None if they do not contain it.
+    """Length of link 1 that follows from the parameters, with its standard error [m]; None if they do not determine it.
 
     gravity: gravity in the arm's plane [m/s^2].
     """

@@ -189,8 +189,8 @@ def _next(result: SettledResult, run: Path) -> list[str]:
 
 
 def what_next(result: Result, run: Path) -> str:
-    """Return the line that names the next command: `hil export` or, if the verdict is "no", the command to start over
-    with: `hil check` or, for recordings by other tools, `hil estimate`.
+    """Return the line that names the next command: `hil export`; if the verdict is "no", `hil check` or, for recordings
+    made with other tools, `hil estimate`.
     """
     if not _is_useless(result):
         return next_step("export", run, "--format", _usual_format(result))

@@ -24,7 +24,7 @@ from hil.results.parts import Covariance
 FALSE_ALARMS = 0.05
 LEAST_SHARE = 0.01
 _POWER_Z = 1.645
-"""Number of standard errors by which a change must exceed the threshold to be found with a probability of 95 %."""
+"""Number of standard errors by which a change must exceed the threshold to be detected with a probability of 95 %."""
 
 
 @dataclass(frozen=True)

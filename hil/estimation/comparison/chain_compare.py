@@ -1,4 +1,4 @@
-"""`hil compare` for spatial arms: both stages of hil and filtered inverse dynamics, on one settled period."""
+"""`hil compare` for spatial arms: both stages of hil, and filtered inverse dynamics, on one settled period."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping

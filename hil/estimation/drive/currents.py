@@ -163,7 +163,7 @@ def _clipped(name: str, goal: Array, measured: Array, margin: float, lower: str)
 
 
 def _least(goal: Array) -> Array:
-    """The smaller of two successive goals, which the motor has had time to reach; 0 if the goals differ in sign.
+    """The smaller of two successive goals; the motor has had time to reach it. 0 if the goals differ in sign.
 
     A sample's current is the response to the goal of the sample before it, and a lagging current loop is not clipping.
     """

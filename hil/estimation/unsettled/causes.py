@@ -1,4 +1,4 @@
-"""Reasons why a fit leaves much of the motion unexplained, as far as the recording shows them."""
+"""Reasons why a fit leaves much of the motion unexplained, if the recording reveals any."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -34,7 +34,7 @@ from hil.results.result import ShootingResult
 FITTED_SHARE = 0.75  # of each recording, for the check on the rest
 EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
 TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative error of the torque on the last part: trusted, rejected
-TORQUE_UNEXPLAINED = 0.1  # the same, beyond which a model is rejected that leaves part of the motion unexplained
+TORQUE_UNEXPLAINED = 0.1  # limit for rejecting a model that leaves part of the motion unexplained
 UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
 
 

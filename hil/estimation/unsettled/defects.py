@@ -107,7 +107,7 @@ def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> t
 
 
 def _torque(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
-    # For the first joint, the unknown is the decrease of everything else.
+    # For joint 1, whose torque is the reference, the unknown is the decrease of all other values.
     factor = 1.0 / max(1.0 - unknowns[0], 0.1) if hypothesis.joints == (1,) else 1.0 + unknowns[0]
     change, whose = 100.0 * (factor - 1.0), _joints(hypothesis)
     match hypothesis.course.kind:

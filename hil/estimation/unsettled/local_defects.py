@@ -28,7 +28,7 @@ SHOWN = 3
 
 @dataclass(frozen=True)
 class _Joint:
-    """One joint of a recording, with the residual of the fit. name: as used in messages."""
+    """One joint of a recording, with the residual of the fit. name: its name in messages."""
 
     name: str
     time: Array
@@ -224,7 +224,7 @@ def _windows(joint: _Joint, window: float) -> list[str]:
     times = float(levels[bad].max()) / max(joint.usual, 1e-12)
     return [
         f"The residual of {joint.name} is up to {times:.0f} times its usual value in {parts}{more}: something else "
-        "acted on the arm there, or the recording is wrong. Look at that part, or leave it out."
+        "acted on the arm there, or the recording is wrong. Inspect that part, or leave it out."
     ]
 
 

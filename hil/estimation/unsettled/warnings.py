@@ -26,7 +26,7 @@ UNITS_ADVICE = "check the units, signs and zero of position and torque; then try
 
 @dataclass(frozen=True)
 class Doubts:
-    """Sentences: faults make the estimate unusable, doubts mean that it may be wrong, warnings are for information."""
+    """Sentences: faults make the estimate unusable, doubts mean that it may be wrong, and warnings merely inform."""
 
     faults: tuple[str, ...]
     doubts: tuple[str, ...]
@@ -38,7 +38,7 @@ class Doubts:
 def doubts_of(
     recordings: Sequence[Recording], estimate: ShootingEstimate, cause_known: bool = False, gravity: bool = True
 ) -> Doubts:
-    """Find what looks wrong in the recordings, or in how the estimate explains them.
+    """Find signs of errors in the recordings, or in how the estimate explains them.
 
     cause_known: whether the verdict says why much of the motion is unexplained. gravity: whether gravity acts in the
     arm's plane.
