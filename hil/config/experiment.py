@@ -32,7 +32,9 @@ class ExperimentConfig(Table):
     peak_torque: list[PositiveFloat] | None = Field(
         None, description="N m per joint; with pilot = true, found by dry runs"
     )
-    pilot: bool = Field(False, description="start with a small pilot run, then raise peak_torque to the safe limits")
+    pilot: bool = Field(
+        False, description="start with a small pilot run, then raise peak_torque as far as the limits allow"
+    )
     design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" uses the pilot\'s model')
     ramp: float = Field(1.0, ge=0, le=60, description="s, torque ramp at start and end")
     rest: float = Field(0.5, ge=0, le=60, description="s, time without torque before the motion")
@@ -127,7 +129,7 @@ class ModelConfig(Table):
     cable: bool = Field(False, description=OPTIONS["cable"])
     encoder: bool = Field(False, description=OPTIONS["encoder"])
     lags: bool = Field(False, description=OPTIONS["lags"])
-    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, as far as gravity reveals it")
+    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, to the extent that gravity reveals it")
 
     @property
     def fixed_friction(self) -> Friction:

@@ -49,7 +49,7 @@ class JointConfig(Table):
     @classmethod
     def _no_truth_value(cls, turns: object) -> object:
         if any(isinstance(turn, bool) for turn in (turns if isinstance(turns, list) else [turns])):
-            raise ValueError("it must be 1, or -1 where the servo turns the other way")
+            raise ValueError("it must be 1, or -1 if the servo turns the other way")
         return turns
 
     @model_validator(mode="after")
@@ -81,7 +81,7 @@ class JointConfig(Table):
 
     @property
     def directions(self) -> tuple[int, ...]:
-        """Direction of each servo: +1, or -1 if it turns opposite to the joint."""
+        """Direction of each servo: +1, or -1 if it turns in the opposite direction to the joint."""
         return tuple(self.turns) if isinstance(self.turns, list) else (self.turns,) * len(self.ids)
 
     @property

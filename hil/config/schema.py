@@ -117,7 +117,7 @@ class ArmConfig(Table):
 
 
 class SafetyConfig(Table):
-    """`[safety]`: what, besides exceeding a joint limit, causes the arm to be stopped, and how it is stopped."""
+    """`[safety]`: what causes the arm to be stopped, apart from the joint limits, and how it is stopped."""
 
     watchdog: float = Field(
         0.08, ge=0.02, le=2.54, description="s, time without packets after which a servo stops by itself"

@@ -20,7 +20,7 @@ def kept_bytes(path: Path) -> bytes:
 
 
 def _self_contained(path: Path) -> str:
-    """The MJCF as self-contained text; "" if the file already is self-contained."""
+    """The MJCF as self-contained text; "" if the file is already self-contained."""
     import mujoco
 
     try:

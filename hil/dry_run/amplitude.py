@@ -62,7 +62,7 @@ class AmplitudeOptions:
 
 DEFAULTS = AmplitudeOptions()
 
-AT_MOST = 0.999  # fraction of the largest torque that counts as having reached it, despite rounding
+AT_MOST = 0.999  # a torque above this fraction of the largest one counts as having reached it
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def largest_amplitude(
 def _no_torque(
     config: Config, plan: Plan, ensemble: Ensemble, share: float, pose: Array | None, executor: Executor | None
 ) -> str:
-    """Name the joint and limit that most simulated arms exceed at the smallest torque that was tried."""
+    """Name the joint and limit that the largest number of arms exceed at the smallest torque that was tried."""
     prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
     exceeding = (prediction.shares[:, :GUARDED] >= share).sum(axis=0)
     quantity, at = np.unravel_index(int(np.argmax(exceeding)), exceeding.shape)

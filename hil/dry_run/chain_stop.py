@@ -29,7 +29,7 @@ LAID_DOWN = 0.95
 
 @dataclass(frozen=True)
 class Fall:
-    """The hardest of the simulated falls.
+    """The worst of the simulated falls.
 
     moment: time in the path at which it starts [s]. hits: names of the colliding parts; None if nothing collides within
     FALL_S. seconds: duration [s]. height: largest descent [m]. speed: largest speed at the end of the fall [m/s].
@@ -62,7 +62,7 @@ class LoweringForeseen:
 
 @dataclass(frozen=True)
 class ChainStops:
-    """The hardest fall and the hardest lowering of the arm in any simulated stop of a plan."""
+    """The worst fall and the worst lowering of the arm among the simulated stops of a plan."""
 
     fall: Fall
     lowering: LoweringForeseen

@@ -168,7 +168,7 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         f"When stopped, the arm is lowered within {lowering.seconds:.1f} s; {100 * lowering.lies:.0f} % of the "
         f"simulated stops reach the rest pose (at least {100 * LAID_DOWN:.0f} % are required); smallest clearance on "
         f"the way: {lowering.nearest}.",
-        f"Without commands (cable unplugged, program killed, servo failed) the arm falls. Hardest fall, starting "
+        f"Without commands (cable unplugged, program killed, servo failed) the arm falls. Worst fall, starting "
         f"{fall.moment:.1f} s into the path: {hit} {when} {fall.seconds:.2f} s; largest drop "
         f"{100 * fall.height:.0f} cm, final speed {fall.speed:.1f} m/s.",
     ]

@@ -100,7 +100,7 @@ def stopping_distance(config: Config, plan: Plan, ensemble: Ensemble, velocity: 
 
 
 def beyond_when_planned(config: Config, plan: Plan, ensemble: Ensemble) -> dict[Way, Array]:
-    """Largest overshoot beyond the limits (joints,) [rad], by kind of stop, over stops at any moment of the planned
+    """Largest overshoot beyond the limits (joints,) [rad], by kind of stop, for stops at any moment of the planned
     motion.
     """
     stops = _Stops(config)

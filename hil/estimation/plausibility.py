@@ -17,7 +17,7 @@ from hil.plan.chain_model import torque_constant_stds
 DEVIATIONS = 4.0  # standard errors
 LENGTH_TOLERANCE = 0.05  # relative; link lengths are measured with a ruler
 _UPRIGHT = 0.5  # sine of a link's angle above the horizontal
-FLAT = 0.02  # of the largest commanded torque, below which gravity counts as absent
+FLAT = 0.02  # fraction of the largest commanded torque, below which gravity counts as absent
 
 MOSTLY_BORROWED, CLEARLY_WIDER = 0.85, 2.0
 """Limits on the standard error of the length of link 1 that follows from the parameters, relative to that of its prior.
@@ -29,7 +29,7 @@ Above the first, the length comes mainly from the prior; above the second, the p
 def doubts(
     config: Config, estimate: Estimate, largest_torque: float, known: Sequence[Conflict] = ()
 ) -> tuple[str, ...]:
-    """One sentence per contradiction, except for those in `known`, which have their own sentences.
+    """One sentence per contradiction, except for those in `known`, which are reported separately.
 
     largest_torque: largest commanded torque [N m].
     """

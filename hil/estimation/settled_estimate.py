@@ -76,7 +76,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     jumps, currents = jump_disturbances(config, facts, samples), settled_current_findings(config, samples)
     torque = _torque_instead(other, estimate, drift)
     if jumps:
-        drift = None  # the change was not one of friction
+        drift = None  # it was not friction that changed
     if drift is not None:
         left = drift.after_correction() if is_corrected else drift
         estimate = replace(estimate, covariance=drifting(period, estimate, left))

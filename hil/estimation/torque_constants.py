@@ -12,7 +12,7 @@ from hil.results.parts import Quantity
 
 RATIO = "torque_scale"
 USUAL_RATIO_STD = math.hypot(USUAL_TORQUE_SPREAD, USUAL_TORQUE_SPREAD)
-CONTRADICTORY = 2.0  # standard deviations, those of the torque constants and of the ratio combined
+CONTRADICTORY = 2.0  # combined standard deviations of the torque constants and of the ratio
 COLUMNS_APART = 1.0
 """Relative standard deviation assumed for the ratio of two torque columns with unknown scales."""
 Source = Literal["constant", "column"]

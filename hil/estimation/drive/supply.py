@@ -98,7 +98,7 @@ def supply_notes(config: Config, sag: Sag | None) -> tuple[str, ...]:
     if by_voltage(config).any():
         names = " and ".join(j.name for j, voltage in zip(config.joints, by_voltage(config), strict=True) if voltage)
         return (
-            f"{found} The torque of {names}, driven by voltage, falls with it; the estimate takes this into account. A "
+            f"{found} The torque of {names} (driven by voltage) also falls; the estimate takes this into account. A "
             "stronger supply or a shorter, thicker cable helps.",
         )
     return (

@@ -84,7 +84,7 @@ def position_jumps(time: Array, position: Array, velocity: Array, step: float) -
     elapsed = np.diff(time)
     interval = float(np.median(elapsed))
     unexplained = np.diff(position) - 0.5 * (velocity[1:] + velocity[:-1]) * elapsed
-    # Across lost samples the velocity's curvature counts: the next term of the Euler-Maclaurin formula.
+    # Across lost samples, the velocity's curvature matters: the next term of the Euler-Maclaurin formula.
     curved = elapsed**2 / 12.0 * np.diff(np.gradient(velocity, time))
     unexplained += np.where(elapsed > 1.5 * interval, curved, 0.0)
     unexplained[elapsed > LONGEST_GAP * interval] = 0.0

@@ -31,7 +31,7 @@ from hil.estimator.models.conflicts import Trust, conflict_sentences, contradict
 from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Validation, Verdict
 from hil.results.result import ShootingResult
 
-FITTED_SHARE = 0.75  # of each recording, for the check on the rest
+FITTED_SHARE = 0.75  # fraction of each recording that is fitted; the rest serves as a check
 EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
 TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative error of the torque on the last part: trusted, rejected
 TORQUE_UNEXPLAINED = 0.1  # limit for rejecting a model that leaves part of the motion unexplained

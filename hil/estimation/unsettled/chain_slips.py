@@ -1,4 +1,4 @@
-"""Mistakes in the columns of a spatial arm's recording: clear ones raise CsvError; the fit copes with the rest."""
+"""Mistakes in the columns of a spatial arm's recording: clear ones raise CsvError; the fit tolerates the others."""
 
 from collections.abc import Sequence
 

@@ -95,10 +95,10 @@ def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> t
     match hypothesis.course.kind:
         case "decay":
             said = f"The friction of {whose} seems to start {percent} from its final value and to settle {when}"
-            return said, "Let the arm move for some minutes before you record, so that it is warm."
+            return said, "Let the arm move for a few minutes before you record, so that it is warm."
         case "linear":
             said = f"The friction of {whose} seems to change {when}, by {percent} of its initial value"
-            return said, "Let the arm move for some minutes before you record, so that it is warm."
+            return said, "Let the arm move for a few minutes before you record, so that it is warm."
         case "recording":
             return f"The friction of {whose} seems to differ by {percent} {when}", "Estimate each recording separately."
         case _:

@@ -73,7 +73,7 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
     negative = f"; as given, {', '.join(suspicion.impossible)} would be negative" if suspicion.impossible else ""
     return [
         f"{subject.capitalize()} {seem} to be reversed: with {changed} changed, "
-        f"{unexplained(suspicion.residual, suspicion.residual_given)}{negative}. Correct that in "
+        f"{unexplained(suspicion.residual, suspicion.residual_given)}{negative}. Correct this in "
         "the file, or swap the columns."
     ]
 
