@@ -98,7 +98,7 @@ def diff_runs(before: str | PathLike[str], after: str | PathLike[str]) -> Differ
     models = read_model(before), read_model(after)
     counts = [len(model.joints) for model in models]
     if counts[0] != counts[1]:
-        raise ResultError(f"{before} has {counts[0]} joints and {after} {counts[1]}: they are not the same arm.")
+        raise ResultError(f"{before} has {counts[0]} joints and {after} has {counts[1]}: they are not the same arm.")
     rows = friction_changes(models, (_covariance(before), _covariance(after)))
     difference = diff_models(*models, str(before), str(after), friction=rows)
     same = (f"{before} is compared with itself.",) if before.resolve() == after.resolve() else ()
