@@ -175,7 +175,7 @@ class ArmModel:
             moving = self._viscous(joint, v) + step * self._level(joint, v)
             total = torque[joint - 1] + moving + self.values[f"offset_{joint}"] + self._by_angle(joint, q[joint - 1])
             load = self.values.get(f"load_{joint}", 0.0)
-            # Solves total + step * load * |torque| = torque; its sign is that of total as long as load < 1.
+            # Solves total + step * load * |torque| = torque; torque has the sign of total as long as load < 1.
             applied = total / (1 - load * step * np.sign(total)) if load else total
             torque[joint - 1] = applied / self._ripple(joint, q[joint - 1])
         return torque

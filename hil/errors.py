@@ -47,7 +47,7 @@ __all__ = [
 
 
 class Cause(Enum):
-    """What the guard detected. If measurement and drive still work, the stop can begin with braking."""
+    """What the guard detected. If the measurements and the drive still work, the arm can be braked first."""
 
     POSITION = "position limit"
     VELOCITY = "velocity limit"
@@ -158,8 +158,8 @@ class SafetyStop(ExperimentError):
     """The guard stopped the arm, or a dry run ruled out starting it. Example: joint 2 exceeded its position limit.
 
     overruled: a servo held goals or settings that this program had not written, so the commanded torque did not cause
-    the motion, which therefore reveals nothing about the arm. unheard: whose replies were missing, if nothing else was
-    heard in their place. remedy: the last sentences of the message, which may be replaced once more is known.
+    the motion, which therefore reveals nothing about the arm. unheard: whose replies were missing; None if other
+    packets arrived instead. remedy: the last sentences of the message, which may be replaced when more is known.
     """
 
     overruled = False

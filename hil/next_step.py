@@ -23,7 +23,7 @@ def _quoted(word: str) -> str:
     """Quote a word, as $'...' (bash) if it contains unprintable characters."""
     if word.isprintable():
         return shlex.quote(word)
-    # Python writes bytes in the same way, and in single quotes if they contain a double quote.
+    # The repr of bytes uses the same escapes, and single quotes if the bytes contain a double quote.
     return "$" + repr(os.fsencode(word) + b'"')[1:-2] + "'"
 
 

@@ -40,7 +40,7 @@ def say_behind(console: Console, label: str, text: str, style: str = "") -> None
 
 
 def natural_width(console: Console, table: Table) -> int:
-    """Width that the table needs to show all its values in full."""
+    """Width required to show all values of the table in full."""
     wide = Console(file=console.file, width=10_000)
     return Measurement.get(wide, wide.options, table).maximum
 
@@ -67,7 +67,7 @@ def print_fitting(console: Console, table: Table) -> None:
 
 
 def _paragraphs(table: Table) -> Iterator[tuple[str, list[str]]]:
-    """For each row: the first cell (if empty, that of the row above), and the other cells with their headings."""
+    """For each row, yield the first cell (if empty, that of the row above) and the other cells with their headings."""
     headings = [str(column.header) for column in table.columns]
     title = ""
     for row in zip(*(column.cells for column in table.columns), strict=True):

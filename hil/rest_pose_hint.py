@@ -1,4 +1,4 @@
-"""What to do about a joint that is not where the configuration says it rests."""
+"""Advice for a joint that is not at its configured rest angle."""
 
 import math
 from collections.abc import Sequence

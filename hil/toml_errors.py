@@ -122,7 +122,7 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
 
 
 def what_is_wrong(detail: Any) -> str:
-    """Say what a value must be, given one of pydantic's errors."""
+    """State the requirement that a value violates, given one of pydantic's errors."""
     kind, value = detail["type"], detail["input"]
     if kind in _BOUNDS and str(value).lower() in ("nan", "inf", "-inf"):
         kind = "finite_number"
@@ -130,7 +130,7 @@ def what_is_wrong(detail: Any) -> str:
 
 
 def _exact_length(detail: Any, root: type[BaseModel]) -> str:
-    """Say how many entries a list must have if it is too short or too long and only one length is allowed."""
+    """State the length that a list must have if it is too short or too long and only one length is allowed."""
     if detail["type"] not in {"too_short", "too_long"}:
         return ""
     field = _field_of(detail, root)
@@ -207,13 +207,13 @@ def _meant(value: object, expected: str) -> str:
 
 
 def meant_name(given: str, names: Sequence[str]) -> str:
-    """Return the name that was meant: one that differs only in case, spaces and dashes, or the most similar one; "" if
-    none is similar. Short names never count as similar: grad is not rad.
+    """Return the name that was meant: one that differs only in case, spaces and dashes, or else the most similar one;
+    "" if none is similar. Short names are never considered similar: grad is not rad.
     """
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
     bare = re.sub(r"[^a-z0-9]", "", given.lower())
     long = [name for name in plain if len(name) > 4]
-    # With two wrong characters, a servo's name is another's: XC430-W240 is not XM430-W210.
+    # Two wrong characters can turn one servo's name into another's: XC430-W240 is not XM430-W210.
     cutoff = 0.85 if any(each.isdigit() for each in bare) else 0.75
     near = [bare] if bare in plain else difflib.get_close_matches(bare, long, n=1, cutoff=cutoff)
     return plain[near[0]] if near else ""
@@ -231,7 +231,7 @@ def _in_thousands(expected: str, value: object) -> str:
 
 
 def _bound(value: float) -> str:
-    """Write 12.566370614359172 as 12.57 and leave 100, 0.05 and whole numbers as they are."""
+    """Write 12.566370614359172 as 12.57 and leave 100, 0.05 and whole numbers unchanged."""
     return f"{value:.4g}" if isinstance(value, float) and len(str(value)) > 9 else str(value)
 
 
@@ -268,7 +268,7 @@ def _table(location: Sequence[str | int], root: type[BaseModel]) -> Any:
     keys = [place for place, part in enumerate(location) if isinstance(part, str) and not part.startswith(UNSAID)]
     last = max(keys, default=0)
     model: Any = root
-    free = False  # whether the next part is a key of the user's own
+    free = False  # whether the next part is a key chosen by the user
     for part in location[:last]:
         if not isinstance(part, str) or part.startswith(UNSAID):
             continue

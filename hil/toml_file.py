@@ -112,7 +112,7 @@ def _given_twice(error: str, text: str, number: int) -> str:
         given[within, what] = count
         if header:
             table = what
-        if header and header[1] == "[[":  # this table, and those in it, are new ones
+        if header and header[1] == "[[":  # this table and its subtables are new
             given = {each: at for each, at in given.items() if not _is_within(each, header[2])}
             table = f"the {what} of line {count}"
     return ""

@@ -55,7 +55,7 @@ _FRACTION = re.compile(r"\b(?:relative|fraction|probability|share|N m per N m)\b
 
 
 def unit_of(description: str | None) -> str | None:
-    """Return the unit named by a key's description, FRACTION for a ratio, None if it names none."""
+    """Return the unit named by a key's description; FRACTION for a ratio; None if it names no unit."""
     text = description or ""
     if found := _IN_DESCRIPTION.search(text):
         return found[1] or "degrees C"

@@ -135,6 +135,6 @@ def _run() -> None:
         try:
             print("\n".join(said), file=sys.stderr)
             sys.stdout.flush()
-        except OSError:  # the terminal is closed: nobody reads this, and Python would fail again when it ends
+        except OSError:  # the terminal is closed: nobody reads this, and Python would fail again on exit
             os._exit(code)
         sys.exit(code)

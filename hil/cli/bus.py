@@ -61,7 +61,7 @@ def _check_baud(baud: int) -> None:
 
 
 def check(config: ConfigPath, json_only: Json = False) -> None:
-    """Check for anything that would stop an experiment, and say how to fix it. Torque stays off."""
+    """Check for anything that would prevent an experiment, and say how to fix it. Torque stays off."""
     from hil.api.check import check as check_arm
     from hil.cli.terminal import Terminal
     from hil.cli.views.setup_view import print_findings
@@ -85,7 +85,7 @@ def pose(
     ] = False,
     json_only: Json = False,
 ) -> None:
-    """Show the pose of a URDF or MJCF arm as read from the bus; --guide: check each joint by hand. Torque stays off."""
+    """Show the pose of a URDF or MJCF arm as read from the bus; with --guide, check each joint. Torque stays off."""
     from hil import fakes
     from hil.cli.views.pose_view import moved_values, pose_values, print_moved, print_pose
     from hil.config.schema import load_config

@@ -1,4 +1,4 @@
-"""Handle a closed pipe, a full disk or a stopped terminal on standard output. Results are saved first."""
+"""Handle a closed pipe, a full disk or a stopped terminal on standard output. Results are saved before printing."""
 
 import errno
 import io

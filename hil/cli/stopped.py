@@ -69,7 +69,7 @@ def _catch() -> dict[signal.Signals, Any]:
 def _raise(number: int, frame: FrameType | None) -> None:
     """Raise Terminated, but not while modules are being loaded.
 
-    Python ignores exceptions in callbacks of compiled modules that are being loaded: the stop would be lost.
+    Python ignores exceptions in callbacks of compiled modules that are being loaded: the signal would have no effect.
     """
     inner = frame
     while inner is not None:

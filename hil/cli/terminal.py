@@ -33,7 +33,7 @@ _PHASES = {
 }
 
 _NARROW = 76
-"""Smallest terminal width that fits the bar [columns]."""
+"""Minimum width of a terminal in which the bar is shown [columns]."""
 
 _QUIET_S = 0.7
 """If the arm is at rest and no report has arrived for this time [s], the display says what is being computed."""

@@ -7,12 +7,12 @@ from hil.fakes.names import configs_folder
 
 
 def bundled_configs() -> dict[str, Path]:
-    """The bundled TOML files by name."""
+    """The bundled TOML files, keyed by name."""
     return {path.stem: path for path in sorted(configs_folder().glob("*.toml"))}
 
 
 def find_config(path: Path) -> Path:
-    """Return `path`, or the bundled file of that name if `path` is a bare name and no such file exists."""
+    """Return `path`; if it is a bare name and no such file exists, return the bundled file with that name."""
     if not _is_name(path) or path.exists():
         return path
     return bundled_configs().get(path.name, path)

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 MOST_JOINTS = 7
 POSITION_RESERVE = 0.08
-"""Fraction of a joint's position_limit that a designed path leaves free at either end."""
+"""Fraction of a joint's position range that a designed path leaves free at each end."""
 
 DEFAULT_BAND = (0.1, 1.5)
 """Default frequency band of the excitation in a spatial arm's pilot [Hz]."""
 
 _MOST_TURNED_RAD = 4.5 * math.pi
 _SAME_GRAVITY = 0.1  # m/s^2
-_HARMONICS = 2  # of a path, at least
+_HARMONICS = 2  # minimum for a path
 _PLANAR = 2
 _WIDER_RAD = 1e-3
 _OPTIONS = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
@@ -46,20 +46,20 @@ def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
 
 
 def doubted_limits(config: "Config") -> Iterator[str]:
-    """Yield one sentence per joint whose limits in the description make no sense or do not contain its path.
+    """Yield one sentence per joint whose limits in the description are invalid or do not contain its path.
 
     position_limit is allowed to exceed the described limits at either end by the margin that a path leaves free.
     """
     arm = described_arm(config)
     wanted = config.joint_path
     for index, (joint, described) in enumerate(zip(config.joints, arm.joints, strict=True)):
-        if described.limits is None or described.limits == (0.0, 0.0):  # the latter means that limits are missing
+        if described.limits is None or described.limits == (0.0, 0.0):  # (0, 0) means that limits are missing
             continue
         lower, upper = described.limits
         where = f'{arm.path.name}: the limits of joint "{joint.name}" are [{lower:g}, {upper:g}] rad'
         if lower >= upper:
             wrong = ", but they are equal" if lower == upper else ", but the lower limit must come first"
-            yield f"{where}{wrong}. They are ignored; correct them."
+            yield f"{where}{wrong}. These limits are ignored; correct them."
             continue
         if max(-lower, upper) > _MOST_TURNED_RAD:
             in_rad = f"[{math.radians(lower):.3g}, {math.radians(upper):.3g}]"
@@ -76,7 +76,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
             shown = f"position_limit = [{joint.position_limit[0]:g}, {joint.position_limit[1]:g}]"
             yield (
                 f"{where}, but {key} lets it move from {low:.3g} to {high:.3g} rad ({shown}): it may run into its "
-                f"stops. Narrow {key}, or correct the limits."
+                f"end stops. Narrow {key}, or correct the limits."
             )
 
 
@@ -93,7 +93,7 @@ def doubted_gravity(config: "Config") -> Iterator[str]:
 
 
 def _mounted(gravity: Array) -> str:
-    """Say which settings give this gravity in the frame of the base (3,) [m/s^2]."""
+    """Explain which settings produce this gravity in the frame of the base (3,) [m/s^2]."""
     strength = float(np.linalg.norm(gravity))
     if strength <= _SAME_GRAVITY:
         return "The file sets gravity to zero: correct it."
@@ -124,7 +124,7 @@ def describes_planar(config: "Config") -> bool:
 
 
 def only_planar(config: "Config", what: str) -> None:
-    """Raise ConfigError if the arm is spatial, because `what` needs a planar arm."""
+    """Raise ConfigError if the arm is spatial. The message says that `what` supports only planar arms."""
     if config.is_chain:
         raise ConfigError(
             f"{config.path}: {what} supports only planar arms so far; this one has arm.urdf. For spatial arms, use "
@@ -188,7 +188,7 @@ def _planar_slips(config: "Config") -> Iterator[str]:
     if config.arm.urdf is None and config.joint_path is not None:
         yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
     if config.model.base_tilt:
-        yield "model.base_tilt: tilting a planar arm acts like a shifted zero of its first joint: use model.zeros"
+        yield "model.base_tilt: tilting a planar arm has the same effect as a zero error of joint 1: use model.zeros"
 
 
 def _path_slips(config: "Config") -> Iterator[str]:
@@ -224,7 +224,7 @@ def _path_slips(config: "Config") -> Iterator[str]:
 
 
 def _changed(path: str) -> float:
-    """The file's modification time [s], so that a changed file is read again."""
+    """The file's modification time [s]; the file is read again when this changes."""
     try:
         return Path(path).stat().st_mtime
     except OSError:

@@ -75,7 +75,7 @@ class Columns(Table):
         None, description="N m/V per joint at standstill: stall torque over voltage, or torque_constant / resistance"
     )
     between: Literal["held", "linear"] = Field(
-        "linear", description="torque between samples: held for a command, linear for a measurement"
+        "linear", description="torque between samples: held for commands, linear for measurements"
     )
     segment: PositiveFloat = Field(
         1.0, le=60, description="s, duration of each shooting segment; its initial state is estimated"

@@ -32,7 +32,9 @@ class ExperimentConfig(Table):
     peak_torque: list[PositiveFloat] | None = Field(
         None, description="N m per joint; with pilot = true, found by dry runs"
     )
-    pilot: bool = Field(False, description="find peak_torque with a small pilot run first, then raise it to the limits")
+    pilot: bool = Field(
+        False, description="start with a small pilot run, then raise peak_torque as far as the limits allow"
+    )
     design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" uses the pilot\'s model')
     ramp: float = Field(1.0, ge=0, le=60, description="s, torque ramp at start and end")
     rest: float = Field(0.5, ge=0, le=60, description="s, time without torque before the motion")
@@ -69,7 +71,7 @@ class ExperimentConfig(Table):
         if self.band is not None:
             low, high = self.band
             if not 0 < low < high < self.rate / 4:
-                rule = f"must be 0 < low < high < rate / 4 = {self.rate / 4:g} Hz"
+                rule = f"must satisfy 0 < low < high < rate / 4 = {self.rate / 4:g} Hz"
                 raise ValueError(f"band = [{low}, {high}]: {rule}{self._meant(self.band)}")
         for lines in self.lines or []:
             if not lines or len(set(lines)) != len(lines) or min(lines) < 1 or max(lines) > samples / 4:
@@ -77,7 +79,7 @@ class ExperimentConfig(Table):
         return self
 
     def _meant(self, band: list[float]) -> str:
-        """Suggest a unit in which the band may have been given if it is too high for the rate in Hz."""
+        """If the band is too high for the sample rate, suggest the unit in which it may have been given."""
         hint = in_other_units(band, "Hz", lambda line: 0.5 / self.period <= line < self.rate / 4)
         return f". {hint}" if hint and band[0] < band[1] else ""
 
@@ -127,7 +129,7 @@ class ModelConfig(Table):
     cable: bool = Field(False, description=OPTIONS["cable"])
     encoder: bool = Field(False, description=OPTIONS["encoder"])
     lags: bool = Field(False, description=OPTIONS["lags"])
-    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, as far as gravity reveals it")
+    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, to the extent that gravity reveals it")
 
     @property
     def fixed_friction(self) -> Friction:

@@ -10,7 +10,7 @@ def url_from(url: str, file: Path) -> str:
     """The URL with a fake arm's path resolved against the folder of the configuration `file`; other URLs are
     unchanged.
 
-    An empty path means the file itself. The name of a bundled arm is left as it is.
+    An empty path means the file itself. The name of a bundled arm is left unchanged.
     """
     if not url.startswith(FAKE_URL):
         return url

@@ -19,12 +19,14 @@ class JointConfig(Table):
     servos: OneOrList[BusId] = Field(alias="id", description="bus ID, or the IDs of the joint's two servos")
     model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
     turns: OneOrList[Literal[-1, 1]] = Field(
-        1, alias="direction", description="-1 where the servo turns opposite to the joint; one entry per servo"
+        1,
+        alias="direction",
+        description="-1 if the servo turns in the opposite direction to the joint; one entry per servo",
     )
     zero_ticks: int = Field(
         ge=-1_048_575,
         le=1_048_575,
-        description="Present Position where the angle is zero",
+        description="Present Position at which the angle is zero",
     )
     mode: Literal["current", "pwm"] | None = Field(None, description="default: current if the servo model supports it")
     torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")
@@ -40,14 +42,14 @@ class JointConfig(Table):
     @classmethod
     def _of_the_first_servo(cls, ticks: object) -> object:
         if isinstance(ticks, list):
-            raise ValueError("it must be one whole number; for two servos, give the first servo's")  # noqa: TRY004  pydantic's
+            raise ValueError("it must be one whole number; for two servos, give the first servo's value")  # noqa: TRY004  pydantic's
         return ticks
 
     @field_validator("turns", mode="before")
     @classmethod
     def _no_truth_value(cls, turns: object) -> object:
         if any(isinstance(turn, bool) for turn in (turns if isinstance(turns, list) else [turns])):
-            raise ValueError("it must be 1, or -1 where the servo turns the other way")
+            raise ValueError("it must be 1, or -1 if the servo turns the other way")
         return turns
 
     @model_validator(mode="after")
@@ -79,7 +81,7 @@ class JointConfig(Table):
 
     @property
     def directions(self) -> tuple[int, ...]:
-        """Direction of each servo: +1, or -1 if it turns opposite to the joint."""
+        """Direction of each servo: +1, or -1 if it turns in the opposite direction to the joint."""
         return tuple(self.turns) if isinstance(self.turns, list) else (self.turns,) * len(self.ids)
 
     @property

@@ -20,8 +20,8 @@ _MOST_TURN_RAD = 4 * PI
 _LONGEST_M = 3.0
 _SHORTEST_M = 2e-3
 _LEAST_TIME_SQUARED = 0.1  # s^2/rad
-"""Largest plausible ratio of inertia to stall torque [s^2/rad]: such a joint accelerates at 10 rad/s^2 at most, a tenth
-of the usual value.
+"""Largest plausible ratio of inertia to stall torque [s^2/rad]: such a joint accelerates at no more than 10 rad/s^2,
+a tenth of the usual value.
 """
 
 _MOST_ROTOR = 1e-4  # kg m^2, on the motor's side of the gears
@@ -76,7 +76,7 @@ def _joint(joint: "JointConfig") -> Iterator[str]:
         )
     volts = max(stall.voltage for stall in model.stalls)
     fastest = volts / model.back_emf
-    # The stall figures imply a motor up to twice as fast, and files that rely on them do not contain unit errors.
+    # The stall figures imply a no-load speed up to twice as high; a limit derived from them is not a unit error.
     most = _SPEED * max(fastest, volts / model.torque_per_ampere.low)
     if joint.velocity_limit > most:
         yield (

@@ -69,8 +69,10 @@ class PortConfig(Table):
         min_length=1, description='device or pyserial URL; "fake://" opens the [fake] arm of the same file'
     )
     baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
-    one_write: bool = Field(True, description="send goals and read request in one write; set as hil check advises")
-    fast_sync_read: bool = Field(True, description="use Fast Sync Read where every servo's firmware supports it")
+    one_write: bool = Field(
+        True, description="send the goals and the read request in one write; set this as hil check advises"
+    )
+    fast_sync_read: bool = Field(True, description="use Fast Sync Read if every servo's firmware supports it")
 
 
 class PriorConfig(Table):
@@ -115,13 +117,13 @@ class ArmConfig(Table):
 
 
 class SafetyConfig(Table):
-    """`[safety]`: what stops the arm besides the joint limits, and how."""
+    """`[safety]`: what causes the arm to be stopped, apart from the joint limits, and how it is stopped."""
 
     watchdog: float = Field(
         0.08, ge=0.02, le=2.54, description="s, time without packets after which a servo stops by itself"
     )
     allow_no_watchdog: bool = Field(
-        False, description="accept firmware without a Bus Watchdog; nothing stops the servo if packets cease"
+        False, description="accept firmware without a Bus Watchdog: if packets cease, nothing stops the servo"
     )
     write_current_limit: bool = Field(True, description="lower each servo's Current Limit for the run, then restore it")
     missing_time: PositiveFloat = Field(0.015, le=2, description="s, time for which a servo may fail to reply")
@@ -150,7 +152,7 @@ class SafetyConfig(Table):
     stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes, where possible, before torque is cut')
     damp_time: float = Field(0.06, ge=0, le=2, description="s, maximum braking time")
     lower_speed: PositiveFloat = Field(
-        0.6, le=5, description="rad/s, speed at which a stop lowers a spatial arm to its rest pose"
+        0.6, le=5, description="rad/s, speed at which a stopped spatial arm is lowered to its rest pose"
     )
     lower_time: PositiveFloat = Field(
         10.0, le=60, description="s, time limit for lowering; lower_speed is exceeded if necessary to meet it"
@@ -286,15 +288,15 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is spatial: a description is given that is not planar, or is used with a [joint_path]."""
+        """Whether the arm is spatial: its description is not planar, or is used with a [joint_path]."""
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property
     def rest_tolerance(self) -> float:
         """Largest deviation from the rest pose at the start [rad]: `arm.rest_tolerance`.
 
-        The default for a spatial arm is LYING_RAD: such an arm lies on something, and comes to rest closer to its
-        rest pose than a hanging arm does.
+        The default for a spatial arm is LYING_RAD: such an arm lies on a support, and comes to rest closer to
+        its rest pose than a hanging arm does.
         """
         is_given = "rest_tolerance" in self.arm.model_fields_set
         return LYING_RAD if self.is_chain and not is_given else self.arm.rest_tolerance
@@ -435,7 +437,7 @@ def port_url(port: str) -> str:
 
 
 def _is_only_fake(path: Path) -> bool:
-    """Whether a TOML file describes only a fake arm, which `hil fake` accepts."""
+    """Whether a TOML file describes only a fake arm; `hil fake` accepts such a file."""
     try:
         values = load_toml(path)
     except TomlFileError:

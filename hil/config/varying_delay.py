@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from hil.config.schema import Config
 
 _LOOP_HZ = 1000
-"""Assumed rate of the servos' control loop [Hz], which ROBOTIS does not publish; the fake servos have it."""
+"""Assumed rate of the servos' control loop [Hz], which ROBOTIS does not publish; the fake servos use the same rate."""
 
 _FASTEST = 4.0
 """Only a beat slower than this many times the highest excited frequency is noticeable."""
@@ -24,7 +24,7 @@ _CHOICES = (20, 25, 40, 50, 100, 125, 200, 250, 500, 1000)
 
 
 def varying_delay(config: "Config") -> str:
-    """Return a sentence about a slow beat between sample rate and control loops; "" if there is none."""
+    """Return a sentence about a slow beat between the sample rate and the control loops; "" if there is none."""
     if all(joint.drive_mode is not Mode.PWM for joint in config.joints):
         return ""
     rate = config.experiment.rate
@@ -37,7 +37,7 @@ def varying_delay(config: "Config") -> str:
     choices += [f"{each}" for each in _CHOICES if each > rate][:1]
     return (
         f"At experiment.rate = {rate:g}, the delay of the goals probably varies by up to 1 ms, {often} a second, "
-        f"because servos without current mode apply a goal at the next step of their control loop, about every ms. "
+        f"because servos without current mode apply a goal at the next step of their control loop, about once per ms. "
         f"Choose a rate that divides 1000, such as {' or '.join(choices)}."
     )
 

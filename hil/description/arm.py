@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 class ArmFileError(ValueError):
-    """Raised when a file cannot be read or does not describe a serial arm; the message names file and element."""
+    """Raised if a file cannot be read or does not describe a serial arm; the message names the file and the element."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Body:
 
 
 MOST_LINKS = 500
-"""Largest number of links that a description may have: no real arm has so many, and the tree is walked recursively."""
+"""Maximum number of links in a description: no real arm has this many, and the tree is traversed recursively."""
 
 
 def check_size(links: int, path: Path) -> None:
@@ -97,8 +97,8 @@ class ArmJoint:
     fixed: tuple[str, ...]
     """Names of the links attached to this joint's link by fixed or held joints."""
     movable: Mapping[str, Body] = field(default_factory=dict)
-    """The links in `fixed` that held joints move: their bodies by link name, in the frame of this joint's link. A body
-    does not include the links attached to it.
+    """Bodies of those links in `fixed` that held joints move, keyed by link name, in the frame of this joint's link. A
+    body does not include the links attached to it.
     """
 
 

@@ -12,7 +12,7 @@ def kept_bytes(path: Path) -> bytes:
     """Return the bytes to store as the copy of a URDF or MJCF file. Raises OSError, ArmFileError.
 
     A URDF is kept unchanged. MuJoCo cannot read an MJCF whose meshes, textures or included files are missing, so an
-    MJCF that needs other files is made self-contained, without the shapes that need them.
+    MJCF that needs other files is made self-contained: included files are inlined; shapes that need a file are removed.
     """
     if not is_mjcf(path) or not (text := _self_contained(path)):
         return path.read_bytes()
@@ -20,7 +20,7 @@ def kept_bytes(path: Path) -> bytes:
 
 
 def _self_contained(path: Path) -> str:
-    """The MJCF as self-contained text; "" if the file already is self-contained."""
+    """The MJCF as self-contained text; "" if the file is already self-contained."""
     import mujoco
 
     try:

@@ -20,7 +20,7 @@ HINGE = 3
 LOOPS = {0: "connect", 1: "weld"}
 KINDS = {0: "plane", 2: "sphere", 3: "capsule", 5: "cylinder", 6: "box"}
 SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2}
-COUPLED = 2  # an equality of two joints' angles
+COUPLED = 2  # MuJoCo's equality constraint between two joint angles
 USUAL_GRAVITY = (0.0, 0.0, -9.81)
 
 
@@ -63,9 +63,9 @@ def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
 class Geom:
     """A shape of an MJCF file, in the frame of its moving link.
 
-    link: 0 for whatever is fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh". size: as in
-    MuJoCo, the half edge lengths of a box, or the radius and, except for a sphere, the half length [m]; for a mesh, the
-    half edge lengths of its bounding box. Any other shape is treated as a mesh.
+    link: its number; 0 for shapes fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh". size: as
+    in MuJoCo, the half edge lengths of a box, or the radius and, except for a sphere, the half length [m]; for a mesh,
+    the half edge lengths of its bounding box. Any other shape is treated as a mesh.
     """
 
     link: int
@@ -237,7 +237,7 @@ class _Tree:
         self, body: int, rotation: Array, translation: Array, number: dict[int, int]
     ) -> tuple[int, Array, Array]:
         """The number of the moving link to which a body is fixed, and a pose converted from the body's frame to that
-        link's.
+        link's frame.
         """
         while body != WORLD and body not in number:
             turn, place = self._placed(body)

@@ -6,7 +6,7 @@ from hil.description.arm import ArmDescription, Array
 
 UPRIGHT = (0.0, 0.0, 1.0)
 """The direction opposite to gravity, in the frame of a base that stands upright."""
-LEAST_LEVER = 0.01  # m: an end closer to an axis than this has no direction of motion
+LEAST_LEVER = 0.01  # m: if the arm's end is closer to the axis, it has no direction of motion
 
 
 def end_point(arm: ArmDescription, angles: Array) -> Array:

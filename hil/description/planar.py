@@ -38,8 +38,8 @@ def _first_link(arm: ArmDescription, offsets: list[Array]) -> Array:
 
 
 def _level(axis: Array, link: Array, down: Array) -> bool:
-    """Whether the component of the vector `link` that is perpendicular to `axis` is horizontal, and positive rotation
-    lifts it.
+    """Whether the component of the vector `link` that is perpendicular to `axis` is horizontal, and a positive
+    rotation lifts it.
     """
     across = link - axis * float(axis @ link)
     length = float(np.linalg.norm(across))

@@ -5,7 +5,7 @@ from stat import S_ISDIR, S_ISREG
 
 
 def not_a_file(path: Path) -> str:
-    """Say that a path is a pipe or a device; "" if it is neither or does not exist."""
+    """Return a message if a path is a pipe or a device; "" if it is neither or does not exist."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):

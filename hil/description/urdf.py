@@ -155,7 +155,7 @@ def _body(element: ET.Element | None, where: str, path: Path) -> Body:
 
 
 def _check_shapes(link: ET.Element, where: str, path: Path) -> None:
-    """Raise ArmFileError for a wrong size or origin in a link's collision (otherwise visual) geometry."""
+    """Raise ArmFileError for an invalid size or origin in a link's collision (otherwise visual) geometry."""
     for element in link.findall("collision") or link.findall("visual"):
         _origin(element, where, path)
         for shape in element.find("geometry") or ():
@@ -327,7 +327,7 @@ def _rigid(
 
 
 def _own(link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: set[str]) -> Iterator[tuple[str, Body]]:
-    """Yield a link and all links attached to it by any joint, each with its own body in the frame of the first."""
+    """Yield a link and all links attached to it by any joint, each with its own body in the frame of the first link."""
     yield link, bodies[link]
     for joint in tree.values():
         if joint.parent == link and joint.name not in chosen:

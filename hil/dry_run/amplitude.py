@@ -47,8 +47,8 @@ class AmplitudeOptions:
     polishing_ratio: float = 1.06
     """Factor by which each of the final increases raises a joint's torque."""
     worst_arms: int = 4
-    """After a failed check, the next check starts with the worst arms: as many as may exceed a limit, plus this
-    number.
+    """After a failed check, the next check starts with the worst arms: as many as are allowed to exceed a limit, plus
+    this number.
     """
     back_off: float = 0.93
     """Factor applied to the torque when the check on all arms has failed."""
@@ -62,7 +62,7 @@ class AmplitudeOptions:
 
 DEFAULTS = AmplitudeOptions()
 
-AT_MOST = 0.999  # fraction of the largest torque at which it counts as reached despite rounding
+AT_MOST = 0.999  # a torque above this fraction of the largest one counts as having reached it
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def largest_amplitude(
     worst: NDArray[np.intp] = np.arange(0)
     for _ in range(options.max_rounds):
         plan = scaled(config, base, found)
-        # The arms that were worst with more torque tell most cheaply that this one is too much as well.
+        # The arms that were worst at a higher torque are the cheapest test of whether this torque is too high, too.
         if not _too_many(config, plan, ensemble.only(worst), share, pose, ensemble.size):
             prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
             if _chance(prediction, share) <= config.safety.limit_chance:
@@ -124,7 +124,7 @@ def largest_amplitude(
 def _no_torque(
     config: Config, plan: Plan, ensemble: Ensemble, share: float, pose: Array | None, executor: Executor | None
 ) -> str:
-    """Say which limit of which joint is exceeded by the most simulated arms at the smallest torque that was tried."""
+    """Name the joint and limit that the largest number of arms exceed at the smallest torque that was tried."""
     prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
     exceeding = (prediction.shares[:, :GUARDED] >= share).sum(axis=0)
     quantity, at = np.unravel_index(int(np.argmax(exceeding)), exceeding.shape)

@@ -119,8 +119,8 @@ def simulated_seconds(plan: Plan) -> float:
 
 
 def loop_of(config: Config, segment: PathSegment, rate: float, stops: Array | None = None) -> Loop:
-    """Commands and feedback of the control loop during a segment. stops: the stop against which each joint rests, as in
-    `Loop`.
+    """Commands and feedback of the control loop during a segment. stops: the end stop against which each joint rests,
+    as in `Loop`.
     """
     assert config.stabiliser is not None  # checked with the configuration
     constants = np.array([joint.torque_per_goal for joint in config.joints])
@@ -162,8 +162,8 @@ def _centre(plan: Plan) -> Array:
 def _shares(values: Array, limits: Array, rest: Array, centre: Array) -> Array:
     """Peaks as fractions of the distance to their limits.
 
-    Distances to position limits start at the rest pose or the path's centre, whichever is farther from the limit: an
-    arm may rest close to a limit, which would make the fraction meaningless.
+    Distances to position limits are measured from the rest pose or the path's centre, whichever is farther from the
+    limit: an arm may rest close to a limit, which would make the fraction meaningless.
     """
     shares = np.zeros_like(values)
     shares[:, 2:] = np.abs(values[:, 2:] / limits[2:])

@@ -41,7 +41,7 @@ def prior_arms(config: Config, known: KnownChain, count: int, seed: int = 0) -> 
     drive[:, 4] = _log_normal(random, np.ones(n), torque_constant_stds(config), count)
     drive[:, 5] = _log_normal(random, *friction["lag"], count)
     rotors = _log_normal(random, *friction["armature"], count)
-    # The back-EMF of voltage-driven joints lags too, so that they move like lighter ones.
+    # The back-EMF of voltage-driven joints also lags, which makes these joints behave as if they were lighter.
     lost = friction["generated"][0] * drive[:, 0] * drive[:, 5]
     rotors = rotors - np.minimum(lost, MOST_LOST * rotors)
     every = np.concatenate((links, rotors[:, :, None]), axis=2).reshape(count, -1)

@@ -1,4 +1,4 @@
-"""Simulated stops of a spatial arm, which is lowered if its servos still accept commands, and falls if they do not.
+"""Simulation of stopping a spatial arm: it is lowered if its servos still accept commands, and falls if they do not.
 
 Stops begin at times spread over the planned path. For each, the path home and the unpowered fall up to the first
 collision are simulated.
@@ -29,7 +29,7 @@ LAID_DOWN = 0.95
 
 @dataclass(frozen=True)
 class Fall:
-    """The hardest of the simulated falls.
+    """The worst of the simulated falls.
 
     moment: time in the path at which it starts [s]. hits: names of the colliding parts; None if nothing collides within
     FALL_S. seconds: duration [s]. height: largest descent [m]. speed: largest speed at the end of the fall [m/s].
@@ -46,7 +46,7 @@ class Fall:
 
 @dataclass(frozen=True)
 class LoweringForeseen:
-    """Prediction of how a stop lowers the arm.
+    """Prediction of how the arm is lowered when it is stopped.
 
     seconds: longest duration [s]. nearest: smallest clearance. lies: fraction of simulations that end in the rest pose.
     joint: name of the joint that ends farthest from its rest angle, by `away` [rad]. helps: a remedy.
@@ -62,18 +62,18 @@ class LoweringForeseen:
 
 @dataclass(frozen=True)
 class ChainStops:
-    """The hardest fall and the hardest lowering of the arm in any simulated stop of a plan."""
+    """The worst fall and the worst lowering of the arm among the simulated stops of a plan."""
 
     fall: Fall
     lowering: LoweringForeseen
 
     @property
     def unsafe(self) -> str:
-        """Explain why a stop would not lower the arm safely; "" if it would."""
+        """Explain why the arm would not be lowered safely when stopped; "" if it would be."""
         down = self.lowering
         if down.nearest.room < 0.0:
             return (
-                f"too little clearance when a stop lowers the arm ({down.nearest}; at least "
+                f"too little clearance when a stopped arm is lowered ({down.nearest}; at least "
                 f"{1e3 * down.nearest.needed:.0f} mm required). Lower safety.lower_speed, choose a rest_pose farther "
                 "from obstacles, or specify the masses more accurately"
             )
@@ -163,7 +163,7 @@ def _helps(config: Config, at: int, longest: float, used: float, needed: float) 
         first = f"Raise its {joint.goal_limit_name} to {wanted} if the servo tolerates that, "
     elif used > SATURATED:
         first = f"Raise its {joint.goal_limit_name}, {slower}, "
-    else:  # what is left is friction, or an error of the masses, against a spring that is soft at a low rate
+    else:  # friction or wrong masses, against a stabiliser that is soft because the rate is low
         first = f"Raise experiment.rate above {config.experiment.rate:g}, which makes its stabiliser stiffer, "
     return f"{first}choose a rest_pose in which gravity loads it less, or specify the masses more accurately"
 

@@ -26,7 +26,7 @@ class ChainDryRun:
     amplitude; 1 if [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of
     links with parts that are closer than the margin in nearly every pose and thus not checked. refused: why the pilot
     has no safe first step; "" if it has one, None without a pilot. The pilot's decision overrides the prediction.
-    on_stops: sentence that names the joints assumed to rest against their own stops; "" if there are none.
+    on_stops: sentence that names the joints assumed to rest against their end stops; "" if there are none.
     """
 
     config: Config
@@ -165,12 +165,12 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
     lines = [
         "99 %: in 99 of 100 arms, all peaks stay within these values.",
         f"Least clearance: {run.foreseen}.",
-        f"A stop lowers the arm in at most {lowering.seconds:.1f} s; {100 * lowering.lies:.0f} % of the simulated "
-        f"stops reach the rest pose (at least {100 * LAID_DOWN:.0f} % are required); smallest clearance on the way: "
-        f"{lowering.nearest}.",
-        f"Without commands (cable unplugged, program killed, servo failed) the arm falls. Hardest fall, starting "
-        f"{fall.moment:.1f} s into the path: {hit} {when} {fall.seconds:.2f} s, having fallen "
-        f"{100 * fall.height:.0f} cm, at {fall.speed:.1f} m/s.",
+        f"When stopped, the arm is lowered within {lowering.seconds:.1f} s; {100 * lowering.lies:.0f} % of the "
+        f"simulated stops reach the rest pose (at least {100 * LAID_DOWN:.0f} % are required); smallest clearance on "
+        f"the way: {lowering.nearest}.",
+        f"Without commands (cable unplugged, program killed, servo failed) the arm falls. Worst fall, starting "
+        f"{fall.moment:.1f} s into the path: {hit} {when} {fall.seconds:.2f} s; largest drop "
+        f"{100 * fall.height:.0f} cm, final speed {fall.speed:.1f} m/s.",
     ]
     lines += near_by_design(Space.of(run.config))
     if run.on_stops:

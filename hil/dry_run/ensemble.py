@@ -29,9 +29,9 @@ _MOST_COUPLING = 0.95  # relative to sqrt(inertia_1 inertia_2)
 class Ensemble:
     """An ensemble of possible arms.
 
-    physics: parameters of each arm. torque_scale: ratio of actual to commanded torque (arms, joints), as uncertain as
-    the torque constant; 1 for arms drawn from a result, whose parameters are in units of the commanded torque. source:
-    "prior" or "result".
+    physics: parameters of each arm. torque_scale: ratio of actual to commanded torque (arms, joints), with the
+    uncertainty of the torque constants; 1 for arms drawn from a result, whose parameters are in units of the commanded
+    torque. source: "prior" or "result".
     """
 
     physics: tuple[Physics, ...]

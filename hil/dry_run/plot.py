@@ -38,7 +38,7 @@ def plot(config: Config, prediction: Prediction) -> Any:
             axis.axhline(bound, color="tab:orange", linewidth=1, linestyle="--")
         axis.set_ylabel(f"{joint.name} [rad]")
     axes[0].set_title(
-        "Simulated arms, limits (red), and peaks that 99 % of the arms stay within (dashed)", fontsize=10, loc="left"
+        "Simulated arms, limits (red), and bounds that 99 % of the arms stay within (dashed)", fontsize=10, loc="left"
     )
     axes[-1].set_xlabel("time [s]")
     return figure

@@ -1,8 +1,8 @@
 """Simulate the experiment on an ensemble of arms, and compare the predicted peaks with each limit.
 
 Every arm receives the plan's goal currents, including the ramps, rounded to the servos' ticks, for as many periods as
-it takes to settle. Peaks are fractions of the distance from rest to the limit; the guard would have stopped an arm
-whose peak reaches 1.
+it takes to settle. Peaks are fractions of the distance from rest to the limit; the guard would stop an arm whose
+peak reaches 1.
 """
 
 from collections.abc import Sequence
@@ -46,8 +46,8 @@ class Prediction:
     same values as fractions of the distance from rest to the limit. limits: limits (quantities, joints). settled_after:
     number of periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over
     time of a few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: sampling
-    rate [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at rest or centre,
-    whichever is farther from that limit.
+    rate [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit are then measured from `rest`
+    or `centre`, whichever is farther from that limit.
     """
 
     values: Array

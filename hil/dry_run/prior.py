@@ -19,9 +19,9 @@ from hil.estimator.models.terms import term_of
 _LINK_MASS_PER_LENGTH = 1.1  # kg/m, for XM430 servos with printed or aluminium brackets
 _USUAL_STALL = 4.1  # N m, stall torque of those servos; smaller servos carry lighter links
 _STALL_POWER = 0.4
-_CENTRE_SHARE = 0.6  # of the length; a gripper or weight moves the centre outwards
+_CENTRE_SHARE = 0.6  # fraction of the length; a gripper or weight moves the centre outwards
 _CENTRE_SPREAD = 0.3
-_INERTIA_SHARE = 1 / 12  # of mass times length squared: a rod
+_INERTIA_SHARE = 1 / 12  # fraction of mass times length squared, as for a rod
 _ROUGH_SPREAD = 0.5
 _OFFSET_PER_COULOMB = 0.1  # standard deviation of the offset relative to the Coulomb friction
 _ZERO_STD = 0.03  # rad, typical error of a zero set by eye
@@ -38,7 +38,7 @@ class Quantity:
     spread: Array
 
     def draw(self, random: np.random.Generator, count: int) -> Array:
-        """`count` draws (count, joints), log-normal with median `value`."""
+        """Draw `count` samples (count, joints) from log-normal distributions with median `value`."""
         log_spread = np.sqrt(np.log1p(self.spread**2))
         drawn: Array = self.value * np.exp(log_spread * random.standard_normal((count, self.value.size)))
         return drawn

@@ -1,7 +1,7 @@
-"""Infer which joints of a spatial arm rest against their own mechanical stops in the rest pose.
+"""Infer which joints of a spatial arm rest against their own end stops in the rest pose.
 
-In the rest pose an arm is supported by a surface (floor, cradle, another link) or by the joints' own stops. Moving the
-arm can lift it off a surface, but a stop holds its joint regardless of the other joints' angles.
+In the rest pose an arm is supported by a surface (floor, cradle, another link) or by the joints' own end stops.
+Moving the arm can lift it off a surface, but an end stop holds its joint regardless of the other joints' angles.
 """
 
 from collections.abc import Sequence
@@ -18,18 +18,19 @@ from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan
 
 NEAR_STOP_RAD = 0.14
-"""A joint that rests against a stop is at most this far from the end of its configured or described range [rad]."""
+"""A joint that rests against an end stop is at most this far [rad] from the end of its configured or described range.
+"""
 
 
 PASSED_RAD = 0.05
-"""A joint that has been this far [rad] beyond its rest pose has no stop there: no stop yields that much."""
+"""A joint that has been this far [rad] beyond its rest pose has no end stop there: no end stop yields that much."""
 
 
 def resting_stops(config: Config, arms: ChainArms, planned: Sequence[Array] = (), passed: Mask | None = None) -> Array:
-    """The stop against which each joint rests (joints,): -1 at its smallest angle, 1 at its largest, 0 for neither.
+    """The end stop against which each joint rests (joints,): -1 at its smallest angle, 1 at its largest, 0 for neither.
 
-    A joint is assumed to rest against a stop if its rest pose is near the end of its range, nothing else touches the
-    part of the arm that it moves, and gravity does not pull it away from the stop. This assumption is dropped if a
+    A joint is assumed to rest against an end stop if its rest pose is near the end of its range, nothing else touches
+    the part of the arm that it moves, and gravity does not pull it away from the stop. This is not assumed if a
     recording or a planned path takes the joint beyond its rest pose, within its configured limits. planned: positions
     of the planned paths, each (joints, samples) [rad]. passed: whether each joint has been below and above its rest
     pose, as returned by `passed_rest` (2, joints). Raises ArmFileError.
@@ -61,7 +62,7 @@ def planned_paths(plan: Plan) -> list[Array]:
 
 
 def said_of_stops(config: Config, side: Array) -> str:
-    """Say which joints are assumed to rest against their own stops, and what happens if they do not; "" if none."""
+    """Name the joints assumed to rest against end stops, and say what happens if they do not; "" if there are none."""
     found = []
     for joint, each, rest in zip(config.joints, side.tolist(), config.arm.rest_pose, strict=True):
         if each:
@@ -71,7 +72,7 @@ def said_of_stops(config: Config, side: Array) -> str:
         return ""
     return (
         "Nothing in the description supports these joints in the rest pose, so each is assumed to rest against its "
-        f"own mechanical stop: {', '.join(found)}. If something else supports them, name it in [clearance] (floor, "
+        f"own end stop: {', '.join(found)}. If something else supports them, name it in [clearance] (floor, "
         "boxes). Otherwise they may sag by up to the angle in brackets before position_limit stops the arm."
     )
 

@@ -1,4 +1,4 @@
-"""The whole experiment on one simulated arm, period by period, as the stream runs it on a real one."""
+"""Simulation of the whole experiment on one arm, period by period, just as the stream runs it on a real arm."""
 
 from dataclasses import dataclass
 

@@ -89,7 +89,7 @@ _Piece = tuple[Array, Feedback, int]
 """Commanded torque (joints,) [N m], feedback added to it, and duration in samples."""
 
 _Commands = Callable[[_Start], Iterator[list[_Piece]]]
-"""Yields the commands of a stop from a given start: one list of pieces for each variant of the stop."""
+"""Yields the commands that stop the arm from a given start: one list of pieces for each variant."""
 
 
 def stopping_distance(config: Config, plan: Plan, ensemble: Ensemble, velocity: Array) -> Stopping:
@@ -100,7 +100,7 @@ def stopping_distance(config: Config, plan: Plan, ensemble: Ensemble, velocity: 
 
 
 def beyond_when_planned(config: Config, plan: Plan, ensemble: Ensemble) -> dict[Way, Array]:
-    """Largest overshoot beyond the limits (joints,) [rad], by kind of stop, over stops at any moment of the planned
+    """Largest overshoot beyond the limits (joints,) [rad], by kind of stop, for stops at any moment of the planned
     motion.
     """
     stops = _Stops(config)
@@ -136,7 +136,7 @@ def beyond_when_passed(
 def _farthest(
     stops: "_Stops", ways: Mapping[Way, _Commands], ensemble: Ensemble, starts: Callable[[Physics, Array], list[_Start]]
 ) -> dict[Way, Array]:
-    """The largest overshoot over a few arms and their initial states, by kind of stop (joints,) [rad]."""
+    """The largest overshoot among a few arms and their initial states, by kind of stop (joints,) [rad]."""
     few = ensemble.first(_ARMS)
 
     def one(arm: int) -> list[Array]:
@@ -150,7 +150,7 @@ def _farthest(
 
 
 def _planned_goals(config: Config, plan: Plan) -> Array:
-    """Commanded torque of the whole plan (joints, samples) [N m]; more than two equal periods would add nothing."""
+    """Commanded torque of the whole plan (joints, samples) [N m]; further identical periods would add nothing."""
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     parts = []
     for segment in plan.segments:

@@ -91,7 +91,7 @@ def designed_plan(config: Config, physics: Physics, names: list[str]) -> Plan:
 
 
 def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> DesignProblem:
-    """Arm and limits in the form that the estimator's experiment design expects."""
+    """The arm and its limits in the form that the estimator's experiment design expects."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     velocity = np.array([joint.velocity_limit for joint in config.joints])
     step = np.array([joint.joint.servo.position_unit for joint in config.joints])

@@ -1,4 +1,4 @@
-"""What remains of a stopped run, and the command to continue with."""
+"""What remains of a stopped run, and the command with which to continue."""
 
 from pathlib import Path
 

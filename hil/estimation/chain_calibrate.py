@@ -36,7 +36,7 @@ def calibrate_chain_runs(
     _check_same_geometry(known.base, known_chain(configs[1]).base)
     several = len(configs[0].joints) > 1
     model = replace(wanted_chain_model(configs[0], known), torque_scale=several, added_mass=True)
-    # The configured torque constants are to be checked, so they are not used as a prior.
+    # The calibration checks the configured torque constants, so they are not used as a prior.
     return calibrate_chain(periods[0], periods[1], model, replace(known.prior, scale_precision=None), mass)
 
 

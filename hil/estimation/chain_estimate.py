@@ -62,7 +62,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     beyond = None
     if HELD_OUT in facts.segments:
-        with suppress(RecordingCutShort):  # stopped in the held-out part: what was finished is estimated
+        with suppress(RecordingCutShort):  # the run ended in the held-out part: use what is complete
             other = settled_period(config, facts, samples, HELD_OUT)
             predicted = predict(model, estimate.parameters, other)
             played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
@@ -214,14 +214,15 @@ def _verdict(
     if still:
         trust = "no"
         sentences.append(
-            f"{', '.join(still)} hardly moved, so the recording says little about their inertia and friction: increase "
-            "joint_path.swing and speed, and check that nothing blocks the motion."
+            f"{', '.join(still)} hardly moved, so the recording reveals little about their inertia and friction: "
+            "increase joint_path.swing and speed, and check that nothing blocks the motion."
         )
     if estimate.from_prior:
         trust = lowered(trust, "with care")
         sentences.append(
-            f"The recording says little about {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
-            "wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
+            f"The recording reveals little about {', '.join(estimate.from_prior)}: these values come from the URDF. "
+            "Use wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the "
+            "motion."
         )
     if said := vague(known.prior, known.base.names, estimate.std, estimate.from_prior):
         trust = lowered(trust, "with care")
@@ -264,7 +265,7 @@ def about_zeros(config: Config, estimate: ChainEstimate) -> str:
     if not estimate.doubtful_zeros:
         return (
             f"{held}: a zero error that this motion does not reveal makes the link parameters wrong, although the "
-            "torques are right. Use `hil pose` to check the angles by hand."
+            "torques are correct. Use `hil pose` to check the angles by hand."
         )
     off = ", ".join(
         f"{config.joints[joint - 1].name} is off by about {by:.2g} rad" for joint, by in estimate.doubtful_zeros

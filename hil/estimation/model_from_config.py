@@ -33,6 +33,6 @@ def voltage_driven(config: Config) -> tuple[int, ...]:
 
 
 def lever_of(config: Config) -> float | None:
-    """Length of link 1 divided by gravity [s^2]; None if either is missing or the arm lies flat."""
+    """Length of link 1 divided by gravity [s^2]; None if either is missing or gravity is 0."""
     lengths = config.arm.link_lengths
     return None if lengths is None or len(lengths) != 2 or not config.arm.gravity else lengths[0] / config.arm.gravity

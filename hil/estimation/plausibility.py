@@ -17,18 +17,19 @@ from hil.plan.chain_model import torque_constant_stds
 DEVIATIONS = 4.0  # standard errors
 LENGTH_TOLERANCE = 0.05  # relative; link lengths are measured with a ruler
 _UPRIGHT = 0.5  # sine of a link's angle above the horizontal
-FLAT = 0.02  # of the largest commanded torque, below which gravity counts as absent
+FLAT = 0.02  # fraction of the largest commanded torque, below which gravity counts as absent
 
 MOSTLY_BORROWED, CLEARLY_WIDER = 0.85, 2.0
-"""Standard error of the length of link 1 that follows from the parameters, relative to that of its prior, from which
-the prior is its main source, and from which it must have been widened (`LEVER_DOUBTED`).
+"""Limits on the standard error of the length of link 1 that follows from the parameters, relative to that of its prior.
+Above the first, the length comes mainly from the prior; above the second, the prior must have been widened
+(`LEVER_DOUBTED`).
 """
 
 
 def doubts(
     config: Config, estimate: Estimate, largest_torque: float, known: Sequence[Conflict] = ()
 ) -> tuple[str, ...]:
-    """One sentence per contradiction, except for those in `known`, which have their own sentences.
+    """One sentence per contradiction, except for those in `known`, which are reported separately.
 
     largest_torque: largest commanded torque [N m].
     """
@@ -59,7 +60,7 @@ def wrong_length(length: float | None, gravity: float, estimate: Estimate | Shoo
 
 
 def _seen_length(gravity: float, estimate: Estimate | ShootingEstimate) -> tuple[float, float] | None:
-    """Length of link 1 that follows from the parameters, with its standard error [m]; None if they do not contain it.
+    """Length of link 1 that follows from the parameters, with its standard error [m]; None if they do not determine it.
 
     gravity: gravity in the arm's plane [m/s^2].
     """
@@ -76,8 +77,8 @@ def _seen_length(gravity: float, estimate: Estimate | ShootingEstimate) -> tuple
 
 
 def borrowed_length(config: Config, estimate: Estimate) -> tuple[str, ...]:
-    """Say so if the coupling is known mainly from `arm.link_lengths`, or if the motion contradicts that length but
-    hardly determines it.
+    """Return a sentence if the coupling is known mainly from `arm.link_lengths`, or if the motion contradicts that
+    length but hardly determines it.
     """
     seen = _seen_length(config.arm.gravity, estimate)
     if estimate.model.lever is None or config.arm.link_lengths is None or seen is None:

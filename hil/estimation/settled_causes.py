@@ -16,7 +16,8 @@ from hil.estimator.selection.verdict import MUCH_LEFT
 
 
 def cause_of_residual(config: Config, period: SettledPeriod, validation: Validation) -> str:
-    """Return sentences about a rate that beats with the servos, a wrong direction or a stop; "" if none applies."""
+    """Return sentences about a sample rate that beats with the servos' loops, a wrong direction or an end stop;
+    "" if none applies."""
     said = [varying_delay(config)]
     if float(validation.residual_over_floor.max()) > MUCH_LEFT:
         with suppress(RecordingError):  # a joint that hardly moved

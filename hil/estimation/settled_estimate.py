@@ -56,7 +56,7 @@ log = logging.getLogger(__name__)
 def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledResult:
     """Estimate from the recording in `run`, write its result.json and return the result.
 
-    executor: starts fits early, in case `friction = "auto"` needs them. Raises HilError, EstimationError.
+    executor: runs fits in advance, in case `friction = "auto"` needs them. Raises HilError, EstimationError.
     """
     config, facts = run.load_config(), run.load_facts()
     if config.is_chain:
@@ -76,12 +76,12 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     jumps, currents = jump_disturbances(config, facts, samples), settled_current_findings(config, samples)
     torque = _torque_instead(other, estimate, drift)
     if jumps:
-        drift = None  # what changed was not friction
+        drift = None  # it was not friction that changed
     if drift is not None:
         left = drift.after_correction() if is_corrected else drift
         estimate = replace(estimate, covariance=drifting(period, estimate, left))
     if torque is not None:
-        drift = None  # friction may have changed too, so the standard errors keep its share
+        drift = None  # friction may have changed too, so the standard errors still include its effect
     if other is not None:
         played[HELD_OUT] = _predicted(estimate, other, drift, is_corrected)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
@@ -149,7 +149,7 @@ def _torque_instead(other: SettledPeriod | None, estimate: Estimate, drift: Drif
     """The constant torque that explains the held-out period better than a change of friction; None if there is none."""
     if other is None or drift is None:
         return None
-    # A torque that friction cannot explain makes the change of friction uncertain, so that none is seen.
+    # A torque that friction cannot explain makes the change of friction so uncertain that none is detected.
     if not drift.is_seen and relative_error(other.position, predict_period(estimate, other)).max() <= GOOD_PREDICTION:
         return None
     torque = torque_change(other, estimate)

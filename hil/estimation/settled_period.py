@@ -20,8 +20,8 @@ from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
 
 _AROUND_S, _FEWEST_AROUND = 0.04, 4
-"""A sample's velocity is determined from readings within this time before and after it [s], at least this many on each
-side.
+"""A sample's velocity is determined from the readings within this time [s] on each side of it, or from this many
+readings on each side if those are fewer.
 """
 
 
@@ -82,8 +82,8 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
 
 
 def _passes(position: Array, first: int, on_time: Array) -> tuple[Array, ...]:
-    """Second halves of the settled periods `on_time` (periods, joints, samples) and of the period before them, whose
-    first half may still contain a transient.
+    """Second halves of the settled periods `on_time` (periods, joints, samples) and of the period before them; the
+    first half of the latter may still contain a transient.
     """
     half = on_time.shape[2] // 2
     return position[first - 1, :, half:], *on_time[:, :, half:]
@@ -143,7 +143,7 @@ def scatter(position: Array) -> Array | None:
     seen = np.isfinite(position).sum(axis=0)
     mean = np.nansum(position, axis=0) / np.maximum(seen, 1)
     squares = np.nansum((position - mean) ** 2, axis=0)
-    # Samples received in only one period, or in none, say nothing about the scatter.
+    # Samples received in only one period, or in none, reveal nothing about the scatter.
     several = seen > 1
     variance = np.where(several, squares / np.maximum(seen - 1, 1), 0.0).sum(axis=1)
     std: Array = np.sqrt(variance / np.maximum(several.sum(axis=1), 1) / count)

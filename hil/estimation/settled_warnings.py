@@ -12,8 +12,8 @@ from hil.runs.run_folder import RunFacts
 
 LEAST_SWING = 30.0  # encoder steps
 LOST = 0.005  # fraction of the samples
-LATE = 0.25  # of the interval: a write that is later disturbs the motion noticeably
-BY_LATENESS = 0.3  # of the lost samples: with at least this share of late ones, the computer is the likely cause
+LATE = 0.25  # fraction of the interval: a later write disturbs the motion noticeably
+BY_LATENESS = 0.3  # ratio of late to lost samples above which the computer is the likely cause
 
 
 def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], period: SettledPeriod) -> list[str]:

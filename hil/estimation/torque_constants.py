@@ -12,7 +12,7 @@ from hil.results.parts import Quantity
 
 RATIO = "torque_scale"
 USUAL_RATIO_STD = math.hypot(USUAL_TORQUE_SPREAD, USUAL_TORQUE_SPREAD)
-CONTRADICTORY = 2.0  # standard deviations, those of the torque constants and of the ratio combined
+CONTRADICTORY = 2.0  # combined standard deviations of the torque constants and of the ratio
 COLUMNS_APART = 1.0
 """Relative standard deviation assumed for the ratio of two torque columns with unknown scales."""
 Source = Literal["constant", "column"]
@@ -89,8 +89,8 @@ def contradictions(
     source: Source,
     known: Sequence[Conflict] = (),
 ) -> tuple[str, ...]:
-    """A sentence for each joint whose torque is inconsistent with the first joint's by more than the uncertainty of the
-    torque constants.
+    """A sentence for each joint whose torque disagrees with the first joint's by more than the uncertainty of the
+    torque constants allows.
 
     joints: names. extra: terms of a result that include the ratios, if there are any. ratio_std: relative standard
     deviation of the ratio of the torque constants, by parameter; where it is not given, the spread among servos of one

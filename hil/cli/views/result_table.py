@@ -189,9 +189,8 @@ def _next(result: SettledResult, run: Path) -> list[str]:
 
 
 def what_next(result: Result, run: Path) -> str:
-    """Return the line that names the next command: export or, if the numbers should not be used, the command to start
-    over with. This is a check of the arm; for recordings by other tools, which have no arm to check, it is an estimate
-    from corrected recordings.
+    """Return the line that names the next command: `hil export`; if the verdict is "no", `hil check` or, for recordings
+    made with other tools, `hil estimate`.
     """
     if not _is_useless(result):
         return next_step("export", run, "--format", _usual_format(result))

@@ -24,7 +24,7 @@ from hil.results.parts import Covariance
 FALSE_ALARMS = 0.05
 LEAST_SHARE = 0.01
 _POWER_Z = 1.645
-"""Number of standard errors by which a change must exceed the threshold to be found with a probability of 95 %."""
+"""Number of standard errors by which a change must exceed the threshold to be detected with a probability of 95 %."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def diff_runs(before: str | PathLike[str], after: str | PathLike[str]) -> Differ
     models = read_model(before), read_model(after)
     counts = [len(model.joints) for model in models]
     if counts[0] != counts[1]:
-        raise ResultError(f"{before} has {counts[0]} joints and {after} {counts[1]}: they are not the same arm.")
+        raise ResultError(f"{before} has {counts[0]} joints and {after} has {counts[1]}: they are not the same arm.")
     rows = friction_changes(models, (_covariance(before), _covariance(after)))
     difference = diff_models(*models, str(before), str(after), friction=rows)
     same = (f"{before} is compared with itself.",) if before.resolve() == after.resolve() else ()

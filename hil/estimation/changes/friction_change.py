@@ -2,11 +2,11 @@
 
 Friction parameters are known far better in combination than individually: a 10 % change in one of them may be smaller
 than its standard error and still be obvious. Let d be the difference in the joint's friction parameters between the
-runs, and S the sum of their covariances in the two runs. Two kinds of test are made.
+runs, and S the sum of their covariances in the two runs. Two kinds of test are performed.
 
 one term alone    Did only term i change? The most powerful test is z_i = (S^-1 d)_i / sqrt((S^-1)_ii), and
                   (S^-1 d)_i / (S^-1)_ii is the change that this implies (generalised least squares).
-several at once   Is d anything but noise? d' S^-1 d has a chi-square distribution.
+several at once   Is d more than noise? d' S^-1 d has a chi-square distribution.
 
 Friction itself varies slightly from run to run. The covariance of a single run does not include this, so
 `REPEATABILITY` is added to S.

@@ -1,4 +1,4 @@
-"""`hil compare` for spatial arms: both stages of hil and filtered inverse dynamics, on one settled period."""
+"""`hil compare` for spatial arms: both stages of hil, and filtered inverse dynamics, on one settled period."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -108,7 +108,7 @@ def _methods(config: Config, period: SettledPeriod, judge: Judge) -> Iterator[Pe
     yield Peer(
         "fourier_lines", _simulated(model, linear.value), _by_name(model.linear_names, linear.std), seconds, words, 1
     )
-    recording = joined(period, 2)  # the ends, which the filter spoils, are left out
+    recording = joined(period, 2)  # the ends, which the filter distorts, are left out
 
     def filtered(cutoff: float) -> tuple[Array, Array]:
         return fit_filtered([recording], model, prior, cutoff, linear.delay)

@@ -15,7 +15,7 @@ from hil.estimator.arrays import Array, Mask
 from hil.runs.recording import Phase
 
 LARGE = 0.5
-"""Goals above this fraction of the largest one count as large; smaller ones say little about clipping."""
+"""Goals above this fraction of the largest one count as large; smaller ones reveal little about clipping."""
 
 SHORT = 0.85
 """A current counts as clipped if it is below this fraction of the commanded one."""
@@ -163,7 +163,7 @@ def _clipped(name: str, goal: Array, measured: Array, margin: float, lower: str)
 
 
 def _least(goal: Array) -> Array:
-    """The smaller of two successive goals, which the motor has had time to reach; 0 if the goals differ in sign.
+    """The smaller of two successive goals; the motor has had time to reach it. 0 if the goals differ in sign.
 
     A sample's current is the response to the goal of the sample before it, and a lagging current loop is not clipping.
     """

@@ -91,14 +91,14 @@ def torque_factor(config: Config, sag: Sag | None, samples: NDArray[np.void]) ->
 
 
 def supply_notes(config: Config, sag: Sag | None) -> tuple[str, ...]:
-    """Sentences about supply sag for the verdict; empty without sag."""
+    """Sentences about supply sag for the verdict; empty if the supply does not sag."""
     if sag is None:
         return ()
     found = f"The supply sags: its voltage falls by up to {sag.worst:.2g} V ({100 * sag.share:.2g} %) under load."
     if by_voltage(config).any():
         names = " and ".join(j.name for j, voltage in zip(config.joints, by_voltage(config), strict=True) if voltage)
         return (
-            f"{found} So does the torque of {names}, which the voltage drives; the estimate takes this into account. A "
+            f"{found} The torque of {names} (driven by voltage) also falls; the estimate takes this into account. A "
             "stronger supply or a shorter, thicker cable helps.",
         )
     return (

@@ -15,7 +15,7 @@ from hil.runs.run_folder import RunFacts
 LEAST_STEPS = 8.0  # encoder steps, smallest jump that is reported
 USUAL_QUANTILE = 0.995
 FAR_OUTSIDE = 4.0  # multiple of the usual difference
-AROUND_S = 0.03  # s on either side within which a delayed or filtered velocity has caught up with a real motion
+AROUND_S = 0.03  # s on either side, within which a delayed or filtered velocity catches up with a real motion
 KEPT = 0.6  # fraction of a jump that remains after that time; less is one bad reading, or a real motion
 LONGEST_GAP = 5.0  # sample intervals
 FEWEST = 200  # samples
@@ -84,7 +84,7 @@ def position_jumps(time: Array, position: Array, velocity: Array, step: float) -
     elapsed = np.diff(time)
     interval = float(np.median(elapsed))
     unexplained = np.diff(position) - 0.5 * (velocity[1:] + velocity[:-1]) * elapsed
-    # Across lost samples the velocity's curvature counts: the next term of the Euler-Maclaurin formula.
+    # Across lost samples, the velocity's curvature matters: the next term of the Euler-Maclaurin formula.
     curved = elapsed**2 / 12.0 * np.diff(np.gradient(velocity, time))
     unexplained += np.where(elapsed > 1.5 * interval, curved, 0.0)
     unexplained[elapsed > LONGEST_GAP * interval] = 0.0

@@ -18,7 +18,7 @@ LEAST_RAD = 0.1
 """Smallest shift that is reported [rad]."""
 
 _FRICTION_TIMES = 2.0
-"""Friction that can hold a joint off its hanging position, relative to its servo's typical breakaway friction."""
+"""Friction that can hold a joint away from its hanging position, relative to its servo's typical breakaway friction."""
 
 _STILL_RAD = 0.02
 """Range of positions within which an arm counts as resting [rad]."""

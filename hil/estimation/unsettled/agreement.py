@@ -12,8 +12,8 @@ from hil.estimator.models.terms import kind_of
 UNEXPLAINED = 1.5  # residual over noise above which the recordings are compared
 MUCH_BETTER = 0.5  # largest residual of separate fits, relative to that of the common one
 APART = 4.0  # standard deviations between the values of two recordings
-NAMED = 3  # parameters
-MOST = 8  # recordings: each is fitted once more
+NAMED = 3  # number of parameters named in the message
+MOST = 8  # maximum number of recordings, since each is fitted once more
 
 
 def disagreement(
@@ -38,8 +38,8 @@ def disagreement(
     differs = _differences(alone, called)
     return (
         f"The recordings disagree: separate fits leave residuals of at most {worst:.1f} times the noise, but a common "
-        f"fit leaves {left:.1f} times the noise{': ' if differs else ''}{'; '.join(differs)}. Was the load, the "
-        "mounting or a setting changed between the recordings? Estimate each separately.",
+        f"fit leaves {left:.1f} times the noise{': ' if differs else ''}{'; '.join(differs)}. Did the load, the "
+        "mounting or a setting change between the recordings? Estimate each separately.",
     )
 
 

@@ -19,12 +19,12 @@ from hil.estimator.errors import EstimationError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
 
 SPRING = "cable_stiffness_1"
-CERTAIN = 4.0  # standard errors of a spring that is worth a closer look
+CERTAIN = 4.0  # number of standard errors by which a spring must differ from 0 to be examined
 LEAST = 0.01  # deviation of a scale from 1
 FARTHEST = 0.5, 2.0
-AS_WELL = 1.02  # largest ratio of the residuals if the scale explains the motion as well as the spring
-HANGS_AT = 0.3  # rad: least angle from the columns' origin to where the joint hangs, for its zero to reveal the scale
-CONSISTENT = 0.4  # largest difference between the scales by zero and by spring, relative to their deviation from 1
+AS_WELL = 1.02  # largest ratio of the residuals at which the scale counts as explaining the motion equally well
+HANGS_AT = 0.3  # rad: the zero reveals the scale only if the joint hangs at least this far from the columns' origin
+CONSISTENT = 0.4  # largest difference between the scales from zero and from spring, relative to their deviation from 1
 RESTS = 0.2  # largest torque of the spring where the joint would hang, relative to its range in the motion
 
 
@@ -88,7 +88,7 @@ def _without_spring(
 ) -> tuple[_Scale, ShootingEstimate] | None:
     """The fit with this scale, without springs and with the zeros as given, if it explains the motion equally well."""
     limit = AS_WELL * estimate.residual_over_noise
-    if not scale.by_zero:  # a scale is not exactly a spring: what is left of the spring corrects it
+    if not scale.by_zero:  # a spring only approximates a scale: the remaining spring corrects the factor
         refined = _fitted(recordings, estimate, scale, about, spring=True)
         if refined is None:
             return None

@@ -1,4 +1,4 @@
-"""Reasons why a fit leaves much of the motion unexplained, as far as the recording shows them."""
+"""Reasons why a fit leaves much of the motion unexplained, if the recording reveals any."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.selection.verdict import MUCH_LEFT
 
-CHANGES = ("step", "linear", "decay")  # courses of defects within a recording
+CHANGES = ("step", "linear", "decay")  # time courses of defects within a recording
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def are_known(fitted: Fitted, found: tuple[str, ...]) -> bool:
 
 
 def _stopped_or_clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Sentences about a stop or about clipped torques, whichever leaves less of the torque unexplained."""
+    """Sentences about an end stop or about clipped torques, whichever leaves less of the torque unexplained."""
     stop, clipped = suspect_stop(recordings), suspect_clipped(recordings)
     if stop is None or any(each.residual < stop.residual for each in clipped if each.joint == stop.joint):
         return _clipped(recordings, clipped)
@@ -78,7 +78,7 @@ def _stopped_or_clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
 
 
 def stop_in(recordings: Sequence[Recording]) -> str:
-    """Return a sentence about a joint that seems to press against a stop; "" if there is none."""
+    """Return a sentence about a joint that seems to press against an end stop; "" if there is none."""
     stop = suspect_stop(recordings)
     return "" if stop is None else _stop_said(stop)
 
@@ -86,8 +86,8 @@ def stop_in(recordings: Sequence[Recording]) -> str:
 def _stop_said(stop: Stop) -> str:
     than, stiffness = "above" if stop.side > 0 else "below", float(f"{stop.stiffness:.2g}")
     return (
-        f"Joint {stop.joint} seems to press against something that yields (a stop, a cable or an object) {than} about "
-        f"{stop.at:.3g} rad: with a stiffness of {stiffness:g} N m/rad there, "
+        f"Joint {stop.joint} seems to press against something that yields (an end stop, a cable or an object) {than} "
+        f"about {stop.at:.3g} rad: with a stiffness of {stiffness:g} N m/rad there, "
         f"{unexplained(stop.residual, stop.residual_given)}. Record a motion that does not reach that angle."
     )
 
@@ -120,8 +120,8 @@ def _late(recordings: Sequence[Recording]) -> tuple[str, ...]:
     than = "late" if late.delay > 0.0 else "early"
     return (
         f"The torque of joint {late.joint} seems to be logged about {1e3 * abs(late.delay):.2g} ms too {than}, "
-        f"compared with the other joint: allowing for this, inverse dynamics leaves {100 * late.residual:.2g} % of the "
-        f"torque unexplained instead of {100 * late.residual_given:.2g} %. Shift its column, or log both "
+        f"compared with the other joint: with this corrected, inverse dynamics leaves {100 * late.residual:.2g} % of "
+        f"the torque unexplained instead of {100 * late.residual_given:.2g} %. Shift its column, or log both "
         "torques at the same time.",
     )
 
@@ -145,7 +145,7 @@ def _drifting(recordings: Sequence[Recording]) -> tuple[str, ...]:
         return ()
     return (
         f"The delay of the torque drifts from {1e3 * drift.start:+.3g} ms to {1e3 * drift.end:+.3g} ms over the "
-        f"recording ({1e6 * drift.relative:+.0f} ppm): allowing for this, "
+        f"recording ({1e6 * drift.relative:+.0f} ppm): with this corrected, "
         f"{unexplained(drift.residual, drift.residual_given)}. Torque and position were timed by different "
         "clocks: correct the times of one, or log both with the same clock.",
     )

@@ -31,10 +31,10 @@ from hil.estimator.models.conflicts import Trust, conflict_sentences, contradict
 from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Validation, Verdict
 from hil.results.result import ShootingResult
 
-FITTED_SHARE = 0.75  # of each recording, for the check on the rest
+FITTED_SHARE = 0.75  # fraction of each recording that is fitted; the rest serves as a check
 EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
 TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative error of the torque on the last part: trusted, rejected
-TORQUE_UNEXPLAINED = 0.1  # the same, beyond which a model is rejected that leaves part of the motion unexplained
+TORQUE_UNEXPLAINED = 0.1  # limit for rejecting a model that leaves part of the motion unexplained
 UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
 
 
@@ -238,7 +238,7 @@ def _verdict(
     if found.from_prior:
         trust = lowered(trust, "with care")
         sentences.append(
-            f"The recordings say little about {', '.join(found.from_prior)}: these values come from the URDF."
+            f"The recordings reveal little about {', '.join(found.from_prior)}: these values come from the URDF."
         )
     if said := vague(prior, names, found.std, found.from_prior):
         trust = lowered(trust, "with care")

@@ -1,4 +1,4 @@
-"""Mistakes in the columns of a spatial arm's recording: clear ones raise CsvError; the fit copes with the rest."""
+"""Mistakes in the columns of a spatial arm's recording: clear ones raise CsvError; the fit tolerates the others."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from hil.estimation.unsettled.slips import reversal_said, unexplained
 from hil.estimator.chain.column_faults import ColumnCheck
 from hil.results.parts import Quantity
 
-ROUGHLY = 0.05  # assumed relative standard error of a ratio of torques that a regression gives
+ROUGHLY = 0.05  # assumed relative standard error of a ratio of torques obtained by regression
 
 
 def refuse_chain_slips(check: ColumnCheck | None, joints: Sequence[str], source: str) -> None:
@@ -45,7 +45,7 @@ def late_torque(check: ColumnCheck | None, joints: Sequence[str], fitted: bool) 
     whose = "All torques seem" if late.joint is None else f"The torque of {joints[late.joint]} seems"
     direction = "late" if late.seconds > 0.0 else "early"
     return (
-        f"{whose} to be logged about {1e3 * abs(late.seconds):.0f} ms too {direction}: allowing for this, "
+        f"{whose} to be logged about {1e3 * abs(late.seconds):.0f} ms too {direction}: with this corrected, "
         f"{unexplained(*late.residuals)}. Shift the column in the file; a filter can also cause such a delay.",
     )
 

@@ -94,11 +94,11 @@ def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> t
     percent = " and ".join(f"{100.0 * change:+.2g} %" for change in each)
     match hypothesis.course.kind:
         case "decay":
-            said = f"The friction of {whose} seems to begin {percent} off its final value and to settle {when}"
-            return said, "Let the arm move for some minutes before you record, so that it is warm."
+            said = f"The friction of {whose} seems to start {percent} from its final value and to settle {when}"
+            return said, "Let the arm move for a few minutes before you record, so that it is warm."
         case "linear":
             said = f"The friction of {whose} seems to change {when}, by {percent} of its initial value"
-            return said, "Let the arm move for some minutes before you record, so that it is warm."
+            return said, "Let the arm move for a few minutes before you record, so that it is warm."
         case "recording":
             return f"The friction of {whose} seems to differ by {percent} {when}", "Estimate each recording separately."
         case _:
@@ -107,7 +107,7 @@ def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> t
 
 
 def _torque(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
-    # For the first joint, the unknown is the decrease of everything else.
+    # For joint 1, whose torque is the reference, the unknown is the decrease of all other values.
     factor = 1.0 / max(1.0 - unknowns[0], 0.1) if hypothesis.joints == (1,) else 1.0 + unknowns[0]
     change, whose = 100.0 * (factor - 1.0), _joints(hypothesis)
     match hypothesis.course.kind:

@@ -1,6 +1,6 @@
 """Locate and classify the parts of a recording that the fitted model explains much worse than the rest.
 
-The kinds are frozen readings, missing torques, single wrong samples, and stops.
+The kinds are frozen readings, missing torques, single wrong samples, and impacts on end stops.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,24 +11,24 @@ import numpy as np
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import Recording
 
-FAR_ABOVE = 10.0  # residual of a window, or of a stretch, relative to the usual one of its joint
+FAR_ABOVE = 10.0  # residual of a window or stretch, relative to the usual residual of its joint
 ABOVE_NOISE = 5.0  # the same, relative to the noise
-MOST_WINDOWS = 0.3  # fraction of windows that may be far above: more are no local defect
-SHORTEST, FEWEST = 0.2, 10  # s and samples during which a value stays the same
-MOST_STRETCHES = 5  # in which a value stays the same: more are the nature of the joint or of the commands
+MOST_WINDOWS = 0.3  # largest fraction of windows far above; with more, the defect is not local
+SHORTEST, FEWEST = 0.2, 10  # minimum duration [s] and number of samples of a constant value
+MOST_STRETCHES = 5  # largest number of constant stretches; more are normal for this joint or these commands
 SPIKE_NOISES, SPIKE_USUAL, USUAL_QUANTILE = 20.0, 10.0, 0.95
-LONG = 1.5  # duration of five neighbouring samples, relative to the usual one, from which they lie beside a gap
+LONG = 1.5  # relative to the usual duration of five neighbouring samples; a longer one indicates a gap
 MOST_SPIKES = 0.05  # fraction of the samples
-IMPACT_TIME = 0.01  # s, over which velocities before and after an impact are measured
+IMPACT_TIME = 0.01  # s, time over which the velocities before and after an impact are measured
 IMPACT_USUAL, IMPACT_STEPS = 4.0, 20.0  # change of velocity relative to the usual one, and in encoder steps
 FEWEST_IMPACTS = 3
-SAME_PLACE = 0.02  # of the range of motion
+SAME_PLACE = 0.02  # fraction of the range of motion
 SHOWN = 3
 
 
 @dataclass(frozen=True)
 class _Joint:
-    """One joint of a recording, with the residual of the fit. name: as used in messages."""
+    """One joint of a recording, with the residual of the fit. name: its name in messages."""
 
     name: str
     time: Array
@@ -207,8 +207,8 @@ def _stop(joint: _Joint) -> list[str]:
             continue
         found.append(
             f"{joint.name[0].upper()}{joint.name[1:]} rebounds at {place:.4g} rad {at.size} times, {_at(time[at])}, "
-            "and never moves past it: it hits a stop or an object there, and no model covers impacts. Use the part "
-            "before the first impact, or record motion that stays clear of it."
+            "and never moves past it: it hits an end stop or an object there, and no model covers impacts. Use the "
+            "part before the first impact, or record motion that stays clear of it."
         )
     return found
 
@@ -224,7 +224,7 @@ def _windows(joint: _Joint, window: float) -> list[str]:
     times = float(levels[bad].max()) / max(joint.usual, 1e-12)
     return [
         f"The residual of {joint.name} is up to {times:.0f} times its usual value in {parts}{more}: something else "
-        "acted on the arm there, or the recording is wrong. Look at that part, or leave it out."
+        "acted on the arm there, or the recording is wrong. Inspect that part, or leave it out."
     ]
 
 

@@ -16,7 +16,7 @@ PENDULUM = (0.01, 3.0)  # m: length of a pendulum with the joint's inertia and g
 LINK = (0.01, 2.0)  # m: length of link 1, which coupling and gravity_2 give
 SURE = 4.0  # standard errors
 UNKNOWN = 0.5  # standard error over value
-SHOWN = 1e-3  # of the largest torque of a joint, or of a ratio: less counts as zero
+SHOWN = 1e-3  # fraction of a joint's largest torque, or a ratio, below which a value counts as zero
 
 
 def implausible(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: float) -> list[str]:

@@ -188,8 +188,8 @@ def _named(found: Estimated, read: Converted, config: RecordingConfig) -> Shooti
 
 
 def _brakes(columns: Columns) -> tuple[float | None, ...]:
-    """Return the viscous friction due to each joint's back-EMF [N m s/rad], or None where the torque constant is not
-    known. The tuple is empty if the joints are not driven by voltage.
+    """Return the viscous friction due to each joint's back-EMF [N m s/rad], with None where the torque constant is
+    not known. The tuple is empty if the joints are not driven by voltage.
     """
     gains, constants = columns.gains, columns.torque_constant
     if columns.drive not in {"voltage", "pwm"} or gains is None:

@@ -58,7 +58,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
             f"{source}: {reversal_said(signs.signs)}, {unexplained(signs.residual, signs.residual_given)}. "
             "Correct this in the file, or swap the columns."
         )
-    # All torques reversed leave the same residual, but nothing has a negative inertia.
+    # Reversing all torques leaves the same residual, but no body has a negative inertia.
     inertias = [name for name in signs.impossible if name.startswith("inertia")]
     if inertias and signs.residual < WELL:
         verb = "are" if signs.signs.are_several else "is"
@@ -71,7 +71,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
 def refuse_stuck(recordings: Sequence[Recording], source: str, segment: float) -> None:
     """Raise CsvError if a joint hardly moves in nearly all segments of length `segment` [s].
 
-    Its encoder then shows little but friction, which would take minutes to fit.
+    Its motion is then dominated by friction, and the fit would take minutes.
     """
     for joint in range(recordings[0].joints):
         steps = [
@@ -88,11 +88,11 @@ def refuse_stuck(recordings: Sequence[Recording], source: str, segment: float) -
 
 
 def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None) -> None:
-    """Raise CsvError if the angle of joint 2 is absolute; the message includes the zero if it must change too."""
+    """Raise CsvError if the angle of joint 2 is absolute; the message also gives the zero if that must change."""
     joints = recordings[0].joints
     free = suspect_absolute_unzeroed(recordings) if zero is None else None
     zero = zero or (0.0,) * joints
-    # columns.zero is added after the difference; so far, both zeros were added to the absolute angles.
+    # columns.zero applies to the difference of the angles, but both zeros were added to the absolute angles.
     found = free or suspect_absolute(recordings, (zero[0], zero[0] - zero[-1]))
     if found is None or not _is_clear(found.residual, found.residual_given):
         return
@@ -107,7 +107,7 @@ def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequenc
 
 
 def reversal_said(signs: Signs, joints: Sequence[str] = ()) -> str:
-    """Say which signs are reversed; the caller appends the effect of a correction. joints: names; default: numbers."""
+    """Name the reversed signs; the caller appends the effect of a correction. joints: their names; default: numbers."""
     if signs.are_several:
         return f"{signs.said(joints)} are reversed: with these signs changed"
     return f"{signs.said(joints)} is reversed: with the sign changed"
@@ -118,7 +118,7 @@ def _is_clear(residual: float, given: float) -> bool:
 
 
 def unexplained(residual: float, given: float) -> str:
-    """Say how much of the torque inverse dynamics leaves unexplained with a correction, and how much without it."""
+    """State how much of the torque inverse dynamics leaves unexplained with a correction, and how much without it."""
     return f"inverse dynamics leaves {_percent(residual)} of the torque unexplained instead of {_percent(given)}"
 
 

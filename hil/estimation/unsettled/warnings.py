@@ -15,10 +15,10 @@ from hil.estimator.selection.verdict import MUCH_LEFT
 LEAST_SWING = 30.0  # encoder steps
 LOST = 0.01  # fraction of the samples
 MANY_TURNS = 2.0
-FLAT = 0.05  # fraction of samples at the largest torque; a sine has fewer
+FLAT = 0.05  # fraction of samples at the largest torque; a sine wave has fewer
 LEFT = 0.1  # RMS residual relative to the motion's RMS
-CERTAIN, LEAST_EARLY = 4.0, 0.1  # standard errors and sampling intervals by which a delay is negative
-EQUAL, MOSTLY = 0.1, 0.9  # deviation from a whole number of intervals; fraction of the steps that are so equal
+CERTAIN, LEAST_EARLY = 4.0, 0.1  # least negative delay that is reported, in standard errors and sampling intervals
+EQUAL, MOSTLY = 0.1, 0.9  # deviation of a step from a whole number of intervals; fraction of steps below it
 WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
 
 UNITS_ADVICE = "check the units, signs and zero of position and torque; then try shorter segments"
@@ -26,19 +26,19 @@ UNITS_ADVICE = "check the units, signs and zero of position and torque; then try
 
 @dataclass(frozen=True)
 class Doubts:
-    """Sentences: faults make the estimate unusable, doubts mean that it may be wrong, warnings are for information."""
+    """Sentences: faults make the estimate unusable, doubts mean that it may be wrong, and warnings merely inform."""
 
     faults: tuple[str, ...]
     doubts: tuple[str, ...]
     warnings: tuple[str, ...]
     reason: str = ""
-    """The faults in short, worded as the end of a sentence."""
+    """The faults in brief, phrased as the end of a sentence."""
 
 
 def doubts_of(
     recordings: Sequence[Recording], estimate: ShootingEstimate, cause_known: bool = False, gravity: bool = True
 ) -> Doubts:
-    """Find what looks wrong in the recordings, or in how the estimate explains them.
+    """Find signs of errors in the recordings, or in how the estimate explains them.
 
     cause_known: whether the verdict says why much of the motion is unexplained. gravity: whether gravity acts in the
     arm's plane.
@@ -73,7 +73,7 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
     negative = f"; as given, {', '.join(suspicion.impossible)} would be negative" if suspicion.impossible else ""
     return [
         f"{subject.capitalize()} {seem} to be reversed: with {changed} changed, "
-        f"{unexplained(suspicion.residual, suspicion.residual_given)}{negative}. Correct that in "
+        f"{unexplained(suspicion.residual, suspicion.residual_given)}{negative}. Correct this in "
         "the file, or swap the columns."
     ]
 

@@ -66,7 +66,7 @@ def test_every_ready_file_is_right(path: Path) -> None:
         ("[-4.2, 1.06]", "[-1.2, 1.06]", r"arm\.rest_pose: -1\.5708 rad for joint 'shoulder' is outside"),
         ("[0.80, 0.42]", "[0.80]", r"experiment\.peak_torque has 1 entry; it needs 2"),
         ("[0.80, 0.42]", "[4.0, 0.42]", r"peak_torque: 4 N m for joint 'shoulder' is more than current_limit"),
-        ("band = [0.1, 5.0]", "band = [5.0, 0.1]", r"band = \[5\.0, 0\.1\]: must be 0 < low < high"),
+        ("band = [0.1, 5.0]", "band = [5.0, 0.1]", r"band = \[5\.0, 0\.1\]: must satisfy 0 < low < high"),
         ("band = [0.1, 5.0]", "lines = [[1, 2], [2, 3]]", r"two joints share a harmonic"),
         ("band = [0.1, 5.0]", "", r"give either band or lines"),
         ("baud = 1_000_000", "baud = 1234", r"port\.baud = 1234: must be one of 9600"),
