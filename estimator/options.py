@@ -106,7 +106,7 @@ class LikelihoodOptions:
     """
 
     ftol: float = 1e-5
-    """Final tolerance: the remaining decrease corresponds to a tenth of a standard error of all parameters together."""
+    """Final tolerance: the remaining decrease corresponds to a combined parameter error of 0.1 standard errors."""
     ftol_refine: float = 3e-4
     """Tolerance for comparing candidate minima."""
     ftol_start: float = 3e-3
@@ -191,7 +191,7 @@ class ShootingOptions:
     max_step: float = 1e-3
     """Longest integration step of the last fit [s]."""
     coarse_step: float = 2.6e-3
-    """Longest integration step of the earlier fits [s], which are three times as fast as with `max_step`; their errors
+    """Longest integration step of the earlier fits [s]. They run three times as fast as with `max_step`; their errors
     are hundredths of a standard error.
     """
     start_segments: int = 80

@@ -1,4 +1,5 @@
-"""Filtered inverse-dynamics least squares (IDIM-LS), the field's standard method, for initial guesses and comparison.
+"""Filtered inverse-dynamics least squares (IDIM-LS), the standard method of the field; used for initial guesses and for
+comparison.
 
 Position is low-pass filtered forwards and backwards and differentiated by central differences, and the regressor is
 evaluated. Regressor and torque are filtered identically and decimated, and one weighted linear least-squares problem is
@@ -28,7 +29,7 @@ WORST_CONDITION = 1e8
 
 @dataclass(frozen=True)
 class Rows:
-    """Filtered regressors and torques, decimated to about the rate at which they contain new information."""
+    """Filtered regressors and torques, decimated roughly to the rate that their bandwidth requires."""
 
     regressor: Array
     """Regressors (joints, samples, parameters)."""

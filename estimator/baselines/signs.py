@@ -94,9 +94,9 @@ class Suspicion:
 
 
 def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
-    """Return the reversal that explains the recordings much better than the given signs; None if there is none.
+    """Return the reversal that explains the recordings much better than the given signs.
 
-    Also returns None if filtered inverse dynamics cannot be solved.
+    Returns None if there is none or if filtered inverse dynamics cannot be solved.
     """
     joints = recordings[0].joints
     given = _fit(recordings, Signs((1,) * joints, (1,) * joints))

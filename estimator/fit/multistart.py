@@ -87,7 +87,7 @@ class Search:
         return self._undisguised(refined, replace(minimum, iterations=spent))
 
     def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
-        """Replace constant Stribeck rises by Coulomb friction, unless the fit becomes significantly worse."""
+        """Replace constant Stribeck rises with Coulomb friction, unless the fit becomes significantly worse."""
         if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
             return refined, minimum
         try:

@@ -48,7 +48,7 @@ def find_waves(periods: Sequence[SettledPeriod], linear: LinearEstimate, wave: W
             share = np.asarray(linalg.lstsq(extra, goal, rcond=None)[0], dtype=np.float64)
             explained = float(goal @ goal - np.sum((goal - extra @ share) ** 2))
             best = max(best, (explained, cycles, share), key=lambda trial: trial[0])
-        # Torque appears as measured = applied (1 + ripple) + cogging, so the columns explain their negative.
+        # Motor torque = commanded torque (1 + ripple) + cogging, so the fitted coefficients have the opposite sign.
         found |= {f"{wave}_cycles_{joint + 1}": best[1]}
         found |= {f"{wave}_sin_{joint + 1}": -float(best[2][0]), f"{wave}_cos_{joint + 1}": -float(best[2][1])}
     return found

@@ -37,7 +37,7 @@ from hil.estimator.simulation.back_emf import limited
 
 DEFAULTS = LikelihoodOptions()
 HARDLY = 0.05
-"""Fraction of its usual initial guess at which a new term starts when it is added to a model near its minimum."""
+"""Initial value of a term added to a model near its minimum, as a fraction of the term's usual initial guess."""
 
 
 @dataclass(frozen=True)
@@ -318,9 +318,9 @@ def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Arr
 def _doubting(objective: Objective, minimum: Minimum, errors: _Errors) -> Objective:
     """Return the objective with a wider prior on the length of link 1 if the motion contradicts it; otherwise itself.
 
-    A length that is far from the true one would otherwise be all that determines the coupling in a small motion, which
-    contradicts it by little more than its own standard error. The prior's variance then becomes the one that makes the
-    contradiction typical.
+    Otherwise, in a small motion, a wrong length would practically determine the coupling by itself, since the motion
+    contradicts it by little more than the standard error of the motion's own estimate. The prior's variance is
+    increased until a contradiction of this size is typical.
     """
     lever = objective.lever
     if lever is None or lever.is_doubted:

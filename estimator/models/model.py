@@ -21,7 +21,7 @@ LEVER_STD = 0.05
 motion. That component depends on the configured tilt.
 """
 LEVER_DOUBTED = 1.2
-"""Deviation of the motion's own estimate from this prior, in standard deviations of their difference, from which the
+"""Deviation of the motion's own estimate from this prior, in standard deviations of their difference, above which the
 prior is widened.
 """
 

@@ -31,7 +31,7 @@ filtered deceleration has decayed.
 """
 
 HOLD_S = 0.03
-"""Shortest time for which the torque must lie outside the band [s], so that a gear can cross its play."""
+"""Shortest time for which the torque must lie outside the band [s], which gives a gear time to cross its backlash."""
 
 _SINGLES = 9
 # Scalars of a joint, before its two equations: angle at which it came to rest, whether an equation is stored, half of
@@ -51,7 +51,7 @@ def withstood(rest: Any) -> float:
 
 
 def is_suspect(rest: Any) -> bool:
-    """Return whether the torque is outside the band that friction can balance, or was so until just now."""
+    """Return whether the torque is, or was until just now, outside the band that friction can balance."""
     return bool(rest[_UP] > 0.0 or rest[_DOWN] > 0.0)
 
 
@@ -61,10 +61,11 @@ def forget(rest: Any) -> None:
 
 
 def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta: Any) -> float:
-    """Process a sample; return the largest difference between its residual torque and any since the joint came to rest.
+    """Process a sample; return the largest difference between its residual torque and those since the joint came to
+    rest.
 
-    The residual torque is `torque - row theta`. The difference [N m] is to the smallest or the largest residual so far,
-    whichever is further away: positive to the smallest, negative to the largest. It is 0 while the joint moves.
+    The residual torque is `torque - row theta`. The difference [N m] is measured from the smallest residual so far
+    (positive) or the largest (negative), whichever is further away. It is 0 while the joint moves.
 
     rest: one joint's row of `memory`. stands: filtered indicator of standstill, 0 to 1. torque, row: equation of the
     joint at this sample [N m]. theta: parameters.

@@ -358,7 +358,7 @@ def joint_of(name: str) -> int | None:
 
 
 def base_names(joints: int) -> tuple[str, ...]:
-    """Return the names of the base parameters, in the order that all vectors of them use; raises ModelError."""
+    """Return the names of the base parameters, in the order used in all parameter vectors; raises ModelError."""
     if joints not in RIGID_BODY:
         raise ModelError(f"an arm of {joints} joints: the planar arm model supports one or two")
     friction = (f"{term}_{joint + 1}" for term in BASE_FRICTION for joint in range(joints))

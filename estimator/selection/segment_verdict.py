@@ -150,8 +150,8 @@ def _is_refused(left: float, held_out: Array | None, evidence: SegmentEvidence) 
 def _largest_error(left: float) -> float:
     """Return the largest usable prediction error, relative to the motion's RMS. left: residual over noise.
 
-    If the residual hardly exceeds the noise, a larger error is acceptable: half of a recording with little motion
-    merely determines the parameters less well than the whole recording.
+    If the residual hardly exceeds the noise, a larger error is acceptable: the fit to half of a recording with little
+    motion is merely less accurate than that to the whole recording.
     """
     return EXPLAINED_PREDICTION if left <= NEARLY_EXPLAINED else USABLE_PREDICTION
 

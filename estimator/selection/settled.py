@@ -186,7 +186,7 @@ class Selection:
         return best
 
     def _closest(self) -> list[Trial]:
-        """Return the trials that explain the most, with and without presliding, best first.
+        """Return the trials that explain the motion best, one with and one without presliding, best first.
 
         Ripple is most visible in the fit that explains the most, even if some of its terms are not significant, but
         bristles may have absorbed part of the ripple.
@@ -312,7 +312,7 @@ class Selection:
         """Remove insignificant terms if the motion is explained equally well without them."""
         assert best.estimate is not None
         if self._left(best) > self._options.presliding_residual**2:
-            return best  # effects of missing terms would be attributed to present ones
+            return best  # effects of missing terms would be attributed to those present
         if not best.has_standard_errors:
             return self._pruned_by_fits(best)
         for level in self._options.prune_levels:

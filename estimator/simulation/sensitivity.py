@@ -53,8 +53,8 @@ from hil.estimator.simulation.arm import (
     pieces_now,
 )
 
-# Quantities by which one can differentiate: the constants, the drive's times, encoder errors that move the ends of the
-# springs, the state at the first sample.
+# Quantities with respect to which the motion can be differentiated: the constants, the drive's times, encoder errors
+# that move the ends of the springs, the state at the first sample.
 TRACKED = tuple(f"{name}_{joint}" for name in ENCODER for joint in (1, 2))
 STATES = ("position_1", "position_2", "velocity_1", "velocity_2")
 CAUSES = (*CONSTANTS, "delay", "lag", "lag_difference_2", *TRACKED, *STATES)
@@ -63,7 +63,7 @@ STATE = END + len(TRACKED)
 COUPLING, GRAVITY_1, GRAVITY_2 = map(CONSTANTS.index, ("coupling", "gravity_1", "gravity_2"))
 ZERO_1, ZERO_2 = ZERO, ZERO + 1
 
-AT_ONCE = 8  # causes that a processor may handle at once; their number is padded to a multiple of this
+AT_ONCE = 8  # causes that a processor can handle at once; their number is padded to a multiple of this
 NOWHERE = AT_ONCE * math.ceil(len(CAUSES) / AT_ONCE)  # column for unwanted derivatives
 WIDE = NOWHERE + AT_ONCE
 # Rows of each step by causes: f1, f2, slope_1, slope_2, m11, m12, m22 of stage 1, then of stage 2.
@@ -211,7 +211,7 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     if at[SATURATION + joint] != NOWHERE:
         lost = -cube * shape
         rows[f + at[SATURATION + joint]], rows[s + at[SATURATION + joint]] = lost * passed, lost * loaded * bent
-    # By the torque before saturation and ripple, which includes the back-EMF.
+    # With respect to the torque before saturation and ripple, which includes the back-EMF.
     driven, driven_slope = eased * shape * passed, eased * shape * loaded * bent
     if at[GENERATED + joint] != NOWHERE:
         rows[f + at[GENERATED + joint]], rows[s + at[GENERATED + joint]] = v - v * driven, -v * driven_slope

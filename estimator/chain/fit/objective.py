@@ -94,7 +94,7 @@ class ChainProblem:
         return (x[first : first + size] * self.state_scale).reshape(2, -1)
 
     def run_of(self, period: SettledPeriod, parameters: dict[str, float]) -> ChainRun:
-        """Return the simulation's input for a period, with the delay and lag in `parameters`."""
+        """Return the simulation's input for a period, with the delay and lag taken from `parameters`."""
         torque, slopes = torque_and_slopes(
             *(period.torque, period.rate, period.command_to_sample, self.steps),
             delay=parameters.get("delay", 0.0),
@@ -264,7 +264,7 @@ class ChainProblem:
             where, slopes = self._where(x, index)
             scatter = Scatter(slopes.size, lags)
             for part, r, J in self._pieces(x, index, period, parameters):
-                assert r is not None  # the minimum's motion is finite
+                assert r is not None  # the motion at the minimum is finite
                 scatter.add(np.einsum("sj,sjc->sc", weight[part] ** 2 * r, J))
             total[np.ix_(where, where)] += scatter.sum() * np.outer(slopes, slopes)
         return total
@@ -278,7 +278,7 @@ class ChainProblem:
         where, slopes = self._where(x, index)
         residuals, jacobians = [], []
         for part, r, J in self._pieces(x, index, period, self.parameters(x)):
-            assert r is not None  # the minimum's motion is finite
+            assert r is not None  # the motion at the minimum is finite
             residuals.append(weight[part] * r)
             jacobians.append(weight[part][:, :, None] * J * slopes)
             if part.stop >= most:

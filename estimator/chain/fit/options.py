@@ -32,9 +32,11 @@ class ChainOptions:
     initial_width: float = 0.03
     """Initial width of the smoothed Coulomb step [rad/s]."""
     other_initial_widths: tuple[float, ...] = (0.005, 0.001)
-    """Initial widths of further fits, which are tried until one explains the motion [rad/s]."""
+    """Initial widths for further fits, tried in turn until one explains the motion [rad/s]."""
     far: float = 3.0
-    """Worst joint's RMS residual relative to its noise above which a fit is repeated, first with free encoder zeros."""
+    """RMS residual of the worst joint, relative to its noise, above which a fit is repeated, first with free encoder
+    zeros.
+    """
     poor: float = 1.2
     """RMS weighted residual above which a second initial guess is tried; 1 for noise alone."""
     test_zeros: bool = False

@@ -91,7 +91,7 @@ def losses(base: BaseParameters, parameters: Mapping[str, float], names: tuple[s
     """
     joints, at = base.chain.joints, {name: index for index, name in enumerate(names)}
     generating = _generating(joints, parameters)
-    if _possible(base, parameters, generating) < 1.0:  # at the limit the loss no longer grows with its causes
+    if _possible(base, parameters, generating) < 1.0:  # at the limit, the loss does not depend on these parameters
         return []
     by_lag, by_ratio = lag_slopes(parameters, joints)
     found = []
@@ -151,7 +151,7 @@ def _most_lost(
     largest, parts = 0.0, np.zeros_like(lost)
     for pose in _POSES[:, : base.chain.joints]:
         mass = mass_matrix(base.chain, every, pose)
-        if np.all(np.isfinite(mass)) and linalg.eigvalsh(mass)[0] > 0.0:  # else it cannot be simulated anyway
+        if np.all(np.isfinite(mass)) and linalg.eigvalsh(mass)[0] > 0.0:  # otherwise it cannot be simulated anyway
             fractions, motions = linalg.eigh(root[:, None] * linalg.inv(mass) * root)
             if fractions[-1] > largest:
                 largest, parts = float(fractions[-1]), np.square(motions[:, -1])
