@@ -27,7 +27,7 @@ SETTLING = SettlingOptions()
 class Estimate(FittedParameters):
     """Parameters of the arm estimated from settled periods.
 
-    `std` and `covariance` are the uncertainty due to position errors. They are scaled by the actual residual and
+    `std` and `covariance` describe the uncertainty due to position errors. They are scaled by the actual residual and
     widened if it is correlated (`hil.estimator.fit.covariance`), so they include the true effect of rounding (rounding
     alone leaves a residual of 0.2887 encoder steps RMS). They do not include systematic errors of the torque constant,
     of the encoder's zero or linearity, or of the model. A residual well above 0.29 steps means that the model is

@@ -36,7 +36,7 @@ Setting = tuple[float, float]
 
 @dataclass(frozen=True)
 class Peer:
-    """Result of one method."""
+    """Result of one of the other methods."""
 
     name: str
     parameters: dict[str, float]
@@ -46,7 +46,7 @@ class Peer:
     seconds: float
     """Run time with the chosen settings [s]."""
     settings: str
-    """The chosen settings, as text."""
+    """Description of the chosen settings."""
     tried: int
     """Number of settings tried."""
 

@@ -132,7 +132,7 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
 
 
 def suspect_stop(recordings: Sequence[Recording]) -> Stop | None:
-    """Return the mechanical stop that explains the motion much better than the torque alone or springs do; None if
+    """Return the mechanical stop that explains the motion much better than both the torque alone and springs; None if
     there is none.
     """
     joints = recordings[0].joints
@@ -167,9 +167,7 @@ def _springs(positions: Array) -> Array:
 
 
 def suspect_late(recordings: Sequence[Recording]) -> Late | None:
-    """Return the joint whose torque has a delay of its own, if this explains the motion much better than a common
-    delay.
-    """
+    """Return the joint whose torque has a separate delay, if this explains the motion much better than a common one."""
     joints = recordings[0].joints
     if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
         return None

@@ -47,8 +47,8 @@ class Reversed:
     """Reversed columns.
 
     residuals: relative RMS of the worst joint's torque residual with the change and without it.
-    impossible: whether friction is negative with the columns as given. This happens if all torques are reversed, or
-    the columns of a vertical first joint.
+    impossible: whether friction is negative with the columns as given. This happens if all torques, or columns of a
+    first joint with a vertical axis, are reversed.
     """
 
     residuals: tuple[float, float]
@@ -220,7 +220,8 @@ class ColumnCheck:
         return Late(residuals, chosen, late) if is_late and residuals[0] < LATE * residuals[1] else None
 
     def contradictory_torques(self) -> tuple[float, ...] | None:
-        """Return torque factors relative to joint 1's (joints,) if they explain the recordings better than equal ones.
+        """Return torque factors relative to joint 1's (joints,) if they explain the recordings better than equal
+        factors.
 
         The links' prior is weak and friction absorbs much of an error, so even a small improvement is evidence.
         """
@@ -239,7 +240,7 @@ class ColumnCheck:
         return tuple(factors.tolist())
 
     def wrong_times(self) -> WrongTimes | None:
-        """The time scale that, given gravity and the described geometry, explains the recordings much better than 1."""
+        """The time scale that explains the recordings much better than 1, given gravity and the described geometry."""
         given = self._given[1]
         if not np.any(self.model.base.chain.gravity):
             return None
@@ -318,7 +319,7 @@ def _driven(columns: Array, torque: Array) -> tuple[Array, Array]:
 
 
 def _turned(joints: int) -> Iterator[tuple[int, ...]]:
-    """Yield the angle signs to try: as given, one joint's reversed, all reversed."""
+    """Yield the angle signs to try: unchanged, reversed for one joint, reversed for all joints."""
     yield (1,) * joints
     for joint in range(joints):
         yield tuple(-1 if each == joint else 1 for each in range(joints))

@@ -156,8 +156,8 @@ class Search:
         """Using fine steps, refine the best of `starts` and variants of it with different friction near standstill.
 
         A fit that explains the motion may still have the wrong friction near standstill. The tracking fit determines
-        this friction well, but no fit gets from a narrow Coulomb step to a wide one. Therefore both the friction of the
-        tracking fit and that of `wide` (coordinates) are tried.
+        this friction well, but a fit that starts from a narrow Coulomb step never reaches a wide one. Therefore both
+        the friction of the tracking fit and that of `wide` (coordinates) are tried.
         """
         options = self.options
         ftol = options.ftol_coarse if self.coarse else options.ftol_start

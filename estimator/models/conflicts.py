@@ -15,8 +15,8 @@ from hil.estimator.models.terms import kind_of, term_of
 
 FAR = 4.0  # standard deviations
 LARGE_RATIO, LARGE_ANGLE = 0.35, 0.3
-"""Relative and absolute deviations [1, rad] from a configured value that magnet temperature, tolerances or a horn
-fitted one tooth off cannot explain.
+"""Relative and absolute deviations [1, rad] from a configured value that are too large to be due to magnet temperature,
+tolerances or a horn fitted one tooth off.
 """
 LARGE_SPREAD = 0.3  # standard deviation of a logarithm that is printed as a factor
 Trust = Literal["yes", "with care", "no"]

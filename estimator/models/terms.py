@@ -104,7 +104,7 @@ class Term:
     either sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of the two terms whose geometric mean bounds this term. If this is a term of each joint, both belong to the
+    """Names of the two terms whose geometric mean bounds this term. If each joint has this term, both belong to the
     same joint.
     """
     scale: Scale | float = 1.0
@@ -328,7 +328,7 @@ _DECLARED = (
     ),
 )
 TERMS: dict[str, Term] = {term.name: term for term in _DECLARED}
-"""All terms by name, in the order of every parameter vector."""
+"""All terms by name, in the order used in all parameter vectors."""
 
 RIGID_BODY: dict[int, tuple[str, ...]] = {
     1: ("inertia_1", "gravity_1"),

@@ -97,7 +97,7 @@ def design_path(
     """Design a path with harmonics up to `highest` [Hz] that keeps each joint within limits.
 
     The joints stay within `swing` (joints,) [rad] of `centre` (joints,) [rad] and below `speed` (joints,) [rad/s].
-    rate: samples per second; period [s]; prior: rough parameters, whose uncertainty determines which information
+    rate: samples per second; period [s]; prior: approximate parameters, whose uncertainty determines which information
     matters. Raises ExcitationError.
     """
     count = int(np.floor(highest * period + 1e-9))

@@ -64,7 +64,7 @@ class ChainProblem:
     softness: float
     """Natural frequency of the observer [Hz]."""
     finer: int = 1
-    """Number of smaller integration steps that replace one step in which a joint may be near standstill."""
+    """Number of smaller steps into which an integration step is divided if a joint may be near standstill during it."""
     every: int = 1
     """Only every `every`-th sample is compared, and integration steps are longer by this factor, which may exceed 1
     only if `steps` is 1.
@@ -72,8 +72,8 @@ class ChainProblem:
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; smaller near the minimum."""
     prior_weight: float = 1.0
-    """Scale of the prior's precision; above 1 while model errors exceed the noise that the weights assume, so that the
-    prior still decides what the data do not determine.
+    """Factor on the prior's precision. It exceeds 1 while model errors exceed the noise that the weights assume, so
+    that the prior still decides what the data do not determine.
     """
     added: tuple[Array | None, ...] = ()
     """Known base parameters of the mass added in each period (base parameters,) [SI]; None if there was none."""
@@ -257,7 +257,7 @@ class ChainProblem:
         return self.steps, self.softness, self.finer, self.every
 
     def scatter(self, x: Array, lags: int) -> Array:
-        """Return the matrix S of the scores (coordinates, coordinates); see `hil.estimator.fit.covariance`."""
+        """Return the scatter matrix S of the scores (coordinates, coordinates); see `hil.estimator.fit.covariance`."""
         total = np.zeros((x.size, x.size))
         parameters = self.parameters(x)
         for index, (period, weight) in enumerate(zip(self.periods, self.weights, strict=True)):

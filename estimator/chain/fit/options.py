@@ -23,9 +23,9 @@ class ChainOptions:
     fine_step: float = 1.3e-3
     """Integration step of the last iterations [s]."""
     finer: int = 16
-    """Number of smaller steps that replace one step near standstill, where friction changes fast."""
+    """Number of smaller steps into which a step near standstill is divided, since friction changes fast there."""
     finest: int = 64
-    """Number of smaller steps that replace one step near standstill in the last iterations."""
+    """Number of smaller steps into which a step near standstill is divided in the last iterations."""
     widths_per_substep: float = CoordinateOptions.widths_per_substep
     width_floor: float = 3e-4
     """Minimum width of every Coulomb step [rad/s]; a step this narrow is hardly distinguishable from true sticking."""

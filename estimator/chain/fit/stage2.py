@@ -38,7 +38,7 @@ from hil.estimator.options import CovarianceOptions, MinimiserOptions
 
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 NEARER, LAST = MinimiserOptions(max_damping=0.1), MinimiserOptions(max_damping=1.0)
-"""Options for the last iterations with coarse steps, and for the following ones with fine steps.
+"""Options for the last iterations with coarse steps, and for the subsequent iterations with fine steps.
 
 If a joint is on the verge of sticking, the sum of squares is slightly discontinuous. A decrease achieved only with
 heavy damping is due to such a discontinuity and is not pursued.

@@ -28,7 +28,7 @@ class ChainModel:
     zeros: estimate zero errors of the encoders of all joints but the first, as far as gravity reveals them.
     torque_scale: estimate torque scales of all joints but the first, whose torque constant is trusted.
     base_tilt: estimate the tilt of the base; `base` must come from `BaseParameters.of(..., tilts=True)`.
-    lags: estimate each joint's lag, if `drive` has one, as a ratio to that of the first, since servo models differ.
+    lags: estimate each joint's lag, if `drive` has one, as a ratio to joint 1's, since servo models differ.
     by_voltage: joints (from 1) that are driven by voltage; their back-EMF lags as well.
     added_mass: some periods were recorded with a known mass added, which reveals the first joint's torque constant too.
     Raises ModelError.
@@ -100,7 +100,7 @@ class ChainModel:
 
     @property
     def _has_lags(self) -> bool:
-        """Whether each joint has a lag of its own."""
+        """Whether each joint has its own lag."""
         return self.lags and "lag" in DRIVE[self.drive]
 
     @property

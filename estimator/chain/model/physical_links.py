@@ -120,5 +120,6 @@ def _coordinates(link: Array) -> Array:
 
 
 def _scales() -> Array:
-    """Return the typical step of each coordinate: a factor of e for spreads and mass, centimetres for the centre."""
+    """Return each coordinate's typical step: a factor of e for spreads and mass, 2 cm for the centre, otherwise 3 mm.
+    """
     return np.array([1.0, 1.0, 1.0, 1.0, 0.003, 0.003, 0.02, 0.003, 0.02, 0.02])

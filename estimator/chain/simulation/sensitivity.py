@@ -34,7 +34,7 @@ class ChainRun:
     step: float
     """Length of an integration step [s]."""
     finer: int = 1
-    """Number of smaller integration steps that replace one step in which a joint may be near standstill."""
+    """Number of smaller steps into which an integration step is divided if a joint may be near standstill during it."""
 
 
 PIECE = 256  # samples whose derivatives fit into the processor's cache
