@@ -66,7 +66,7 @@ def uniform(recording: Recording, delay: float = 0.0) -> tuple[Array, Array, flo
 
 
 MoreColumns = Callable[[Array], Array]
-"""Further columns of the regressor (joints, samples, columns) as a function of the positions (joints, samples)."""
+"""Additional regressor columns (joints, samples, columns) as a function of the positions (joints, samples)."""
 
 
 def filtered_rows(
@@ -139,7 +139,7 @@ def fit_inverse_dynamics(
     coulomb_width: width of the smoothed Coulomb step [rad/s].
     delay: delay of the torque [s].
     position_cutoff: cut-off frequency for the positions from which regressors are computed [Hz]; by default `cutoff`.
-    more: further columns of the regressor; their coefficients follow the base parameters and have no names.
+    more: additional regressor columns; their coefficients follow the base parameters and have no names.
     Raises RecordingError, UnidentifiableError.
     """
     rows = [filtered_rows(recording, cutoff, coulomb_width, delay, position_cutoff, more) for recording in recordings]

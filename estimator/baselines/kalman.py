@@ -1,4 +1,5 @@
-"""Extended and unscented Kalman filters whose state includes the parameters: baselines that use positions only.
+"""Extended and unscented Kalman filters whose state includes the parameters: baselines whose only measurements are
+positions.
 
 State: angles, velocities, base parameters. Between samples the motion is integrated by Runge-Kutta steps under the mean
 motor torque; the parameters are constant except for a little process noise; each sample corrects the whole state. EKF:

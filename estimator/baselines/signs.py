@@ -131,7 +131,7 @@ class Absolute:
 
 
 def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = ()) -> Absolute | None:
-    """Return evidence that joint 2's angle is absolute; None if this would not explain the recordings much better.
+    """Return evidence that joint 2's angle is absolute; None if that would not explain the recordings much better.
 
     turned: angles [rad] to try adding to the difference, in case the two angles were measured from different
     directions; quarter turns are always tried. If several fit equally well, the first is chosen.
@@ -180,7 +180,7 @@ def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | No
 
 
 def suspect_order(recordings: Sequence[Recording], torques: bool = True) -> tuple[float, float] | None:
-    """Return evidence that the angles of two joints, and by default also their torques, are in the opposite order.
+    """Return evidence that the angles of two joints, and by default also their torques, are swapped.
 
     See `suspect_swapped` for the result.
     """

@@ -34,8 +34,8 @@ MOST_SAMPLES = 30_000  # more would take too long
 
 @dataclass(frozen=True)
 class Clipped:
-    """A joint whose torque seems limited to `level` [N m], although the torque column exceeds it in a fraction `beyond`
-    of the samples.
+    """A joint whose torque seems limited to `level` [N m], although the torque column exceeds it in the fraction
+    `beyond` of the samples.
 
     residual, residual_given: relative RMS of the joint's torque residual, with the limit and with the torque as given.
     """
@@ -219,7 +219,9 @@ def _delayed(recording: Recording, delays: Array) -> Recording:
 
 
 def suspect_drift(recordings: Sequence[Recording]) -> ClockDrift | None:
-    """Return the drift of the torque's delay if it explains the motion much better than a constant delay, or None."""
+    """Return the drift of the torque's delay if it explains the motion much better than a constant delay, otherwise
+    None.
+    """
     from scipy.optimize import minimize
 
     if sum(each.time.size for each in recordings) > MOST_SAMPLES:

@@ -62,7 +62,7 @@ def choose_chain(
 ) -> ChainChoice:
     """Fit `model`, and richer models if its residual exceeds the noise; choose the best-supported estimate.
 
-    Raises whatever `identify_chain` raises for `model` itself.
+    Raises any error that `identify_chain` raises for `model` itself.
     """
     started = time.perf_counter()
     best = identify_chain(periods, model, prior, test_zeros=True)

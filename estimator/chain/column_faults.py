@@ -60,7 +60,7 @@ class Reversed:
 
 @dataclass(frozen=True)
 class WrongTimes:
-    """Times that are `factor` times the true ones. residuals: as for reversed columns."""
+    """Recorded times that are `factor` times the true times. residuals: as for reversed columns."""
 
     residuals: tuple[float, float]
     factor: float
@@ -105,7 +105,7 @@ class _Solved:
 
     @property
     def misfit(self) -> float:
-        """Negative log likelihood, up to a constant, with each joint's torque in its own unit."""
+        """Negative log likelihood, up to a constant, with each joint's torque scaled by its RMS."""
         return float(np.log(self.relative).sum())
 
 

@@ -87,7 +87,7 @@ class ChainEstimate(FittedParameters):
 
     @property
     def explained(self) -> bool:
-        """Whether the residual is noise alone, so that no further term needs to be tried."""
+        """Whether the residual consists of noise only, so that no further term needs to be tried."""
         return float(self.over_noise.max()) <= EXPLAINED_RESIDUAL and self.systematic <= SYSTEMATIC
 
 

@@ -28,7 +28,7 @@ class PeriodicMotion:
 
 
 def lines_of(signal: Array) -> Lines:
-    """Return the coefficients c_k (..., samples // 2 + 1) of a period (..., samples), the sum of c_k exp(j k w0 t)."""
+    """Return the coefficients c_k (..., samples // 2 + 1) of a period (..., samples): the sum of c_k exp(j k w0 t)."""
     return np.asarray(np.fft.rfft(signal, axis=-1) / signal.shape[-1])
 
 

@@ -73,7 +73,7 @@ class Grid:
 def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[RecordingSegment]:
     """Cut a recording into equal pieces of about `length` [s]; `number` is the recording's index.
 
-    Pieces in which the recording has a gap are left out. Raises RecordingError if no piece contains FEWEST samples.
+    Pieces in which the recording has a gap are omitted. Raises RecordingError if no piece contains FEWEST samples.
     """
     steps = len(grid.edges) - 1
     pieces = max(1, round(steps * grid.step / length))

@@ -24,8 +24,10 @@ IGNORED = 1e-3  # weight of a segment in which a sudden change occurs
 
 @dataclass(frozen=True)
 class AlteredFit:
-    """Result of a fit with or without a defect. values: parameters by name [SI]. unknowns: values of the defect's
-    unknowns. left: mean square of the residual in units of the noise.
+    """Result of a fit with or without a defect.
+
+    values: parameters by name [SI]. unknowns: values of the defect's unknowns. left: mean square of the residual in
+    units of the noise.
     """
 
     values: dict[str, float]

@@ -58,7 +58,7 @@ class _Score:
 
 
 def probable_defect(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool) -> Defect | None:
-    """Return the most probable defect, if one is significant and large enough to matter.
+    """Return the most probable defect if it is significant and large enough to matter, otherwise None.
 
     estimate: fit of a model without terms that could imitate a defect. gravity: whether gravity acts on the arm.
     """
@@ -169,7 +169,7 @@ class _Linear:
 
     @property
     def independent(self) -> float:
-        """Number of samples, reduced for the correlation of the residual."""
+        """Number of samples, reduced to allow for the residual's correlation."""
         return float(self.samples.sum()) / self.colour
 
     def score(self, altered: Altered, hypothesis: Hypothesis, tried: int) -> _Score:

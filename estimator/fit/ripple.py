@@ -20,8 +20,8 @@ from hil.estimator.options import LinearOptions
 
 Wave = Literal["ripple", "cogging"]
 WAVES: tuple[Wave, ...] = get_args(Wave)
-"""Options that add waves over the joint angle: a torque proportional to the motor's (ripple) or independent of it
-(cogging).
+"""Options that add a torque that is periodic over the joint angle: proportional to the motor torque (ripple) or
+independent of it (cogging).
 """
 CYCLES = np.arange(3.0, 40.01, 0.25)  # per turn of the joint; slower variations come from gravity, cables, encoders
 COULOMB_WIDTH = LinearOptions().coulomb_width
@@ -61,8 +61,8 @@ def _parts(each: list[tuple[Array, Array, Array, Array]]) -> list[tuple[Array, i
 def _prepared(
     period: SettledPeriod, motion: PeriodicMotion, harmonics: int, joint: int, delay: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the Fourier coefficients of a joint's columns and torque as real numbers; also its torque and angle over
-    time.
+    """Return the Fourier coefficients of a joint's columns and torque as real numbers, and the joint's torque and angle
+    over time.
     """
     Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)[joint]
     velocity = motion.velocity[joint]

@@ -85,7 +85,7 @@ class Segmented:
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.
-        own: number of coordinates at the end that each belong to one recording.
+        own: number of trailing coordinates, each of which belongs to one recording.
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))

@@ -47,7 +47,7 @@ class Fit:
     value: Array
     """Values in the order of `Model.names` [SI]."""
     covariance: Array
-    """Covariance of `value`, also valid for correlated errors; infinite for parameters without influence."""
+    """Covariance of `value`, also valid for correlated errors; infinite for parameters without effect on the motion."""
     starts: tuple[Array, ...]
     """State at the first sample of each run (2, joints) [rad, rad/s]."""
     positions: tuple[Array, ...]
@@ -64,7 +64,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Near:
-    """A point close to a minimum: the result of a similar model for the same periods."""
+    """A point close to a minimum: the result of fitting a similar model to the same periods."""
 
     parameters: Mapping[str, float]
     """Parameters by name [SI]; others start from their usual initial guess."""
@@ -316,9 +316,9 @@ def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Arr
 
 
 def _doubting(objective: Objective, minimum: Minimum, errors: _Errors) -> Objective:
-    """Return the objective with a wider prior on the length of link 1 if the motion contradicts it; otherwise itself.
+    """Return the objective, with a wider prior on the length of link 1 if the motion contradicts that prior.
 
-    Otherwise, in a small motion, a wrong length would practically determine the coupling by itself, since the motion
+    In a small motion, a wrong length would otherwise practically determine the coupling by itself, since the motion
     contradicts it by little more than the standard error of the motion's own estimate. The prior's variance is
     increased until a contradiction of this size is typical.
     """

@@ -1,4 +1,4 @@
-"""Detection of identified values that are many standard deviations from configured or typical ones.
+"""Detection of identified values that are many standard deviations away from configured or typical ones.
 
 If the model lacks an effect, such as gear backlash, other parameters imitate it. A large deviation from a value known
 beforehand reveals this; standard errors do not.
@@ -54,7 +54,7 @@ class Conflict:
     """Standard deviation of `expected`; if `relative`, of its logarithm."""
     relative: bool
     deviations: float
-    """Distance in combined standard deviations of `value` and `expected`."""
+    """Distance between `value` and `expected`, in combined standard deviations."""
     source: Source
 
     @property

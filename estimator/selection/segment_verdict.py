@@ -86,7 +86,7 @@ def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate, gr
 
 
 def _velocity(recording: Recording) -> Array:
-    """Return velocities, smoothed by the distance over ten samples (joints, samples) [rad/s]."""
+    """Return velocities from central differences of neighbouring samples (joints, samples) [rad/s]."""
     return np.asarray(np.gradient(recording.filled(), axis=1)) / recording.interval
 
 

@@ -336,7 +336,7 @@ class Selection:
         return best
 
     def _pruned_by_fits(self, best: Trial) -> Trial:
-        """Remove terms one by one, testing each by a fit without it: the motion is too sensitive for a test based on
+        """Remove terms one by one, testing each by a fit without it, if the motion is too sensitive for a test based on
         standard errors.
         """
         for part, plainer in removable_parts(best.model):

@@ -125,7 +125,9 @@ def design_path(
 
 @dataclass(frozen=True)
 class Goal:
-    """How accurately a path, together with the prior, determines the torque of other motions in its box."""
+    """Design criterion: how accurately a path, together with the prior, determines the torque of other motions in its
+    box.
+    """
 
     base: BaseParameters
     prior: Prior
@@ -156,7 +158,7 @@ class Goal:
         """Return the effect of each unknown on the angles, in units of their noise (joints samples, unknowns).
 
         A torque acts on the angle through the joint's inertia, and the observer pulls the angle towards the
-        measurements. Each of the few samples represents several samples of the recording.
+        measurements. The path is sampled coarsely: each sample represents several samples of the recording.
         """
         spectrum = np.fft.rfft(columns, axis=1) * self._response[:, :, None]
         noise = NOISE * np.sqrt(self._samples / self.readings)

@@ -228,7 +228,9 @@ class PathDesigner:
         return Design(centre, lines, path, worst, median)
 
     def _fitted(self, centre: Array, lines: Array, waves: tuple[Array, Array, Array]) -> Path | None:
-        """Return the path scaled to the limits of position and speed and shrunk until allowed; None if it never is."""
+        """Return the path scaled to the limits of position and speed, then shrunk until `allowed` accepts it, or else
+        None.
+        """
         room = np.minimum(centre - self._limits.low, self._limits.high - centre)
         span = self._limits.high - self._limits.low
         swing = np.maximum(SWING_SHARE * room, 0.0)

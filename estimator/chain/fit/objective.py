@@ -109,7 +109,7 @@ class ChainProblem:
         )
 
     def _measured(self, period: SettledPeriod) -> Array:
-        """Return the measured angles that are compared (samples, joints) [rad]."""
+        """Return the measured angles that are compared with the simulation (samples, joints) [rad]."""
         return np.ascontiguousarray(period.position.T[:: self.every][: period.samples // self.every])
 
     def _thinned(self, of_steps: Array) -> Array:

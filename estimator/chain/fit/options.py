@@ -15,7 +15,9 @@ class ChainOptions:
     A softer observer extracts more information; one that is too soft no longer follows the motion.
     """
     lost: float = 1.5
-    """A softer observer is rejected if the cost grows by more than this factor times the growth due to its softness."""
+    """A softer observer is rejected if the cost grows by more than this factor times the growth expected from its
+    softness.
+    """
     first_step: float = 5.2e-3
     """Integration step while the observer is stiff [s]; samples within such a step are skipped."""
     coarse_step: float = 2.6e-3
@@ -40,7 +42,8 @@ class ChainOptions:
     poor: float = 1.2
     """RMS weighted residual above which a second initial guess is tried; 1 for noise alone."""
     test_zeros: bool = False
-    """Whether to test the encoder zeros that the model holds fixed; takes one more simulation with sensitivities."""
+    """Whether to test the encoder zeros that the model holds fixed; this takes one more simulation with sensitivities.
+    """
     min_initial_lag: float = 5e-4
     """Minimum initial guess of the lag [s]."""
     reach: float = 0.3

@@ -89,7 +89,9 @@ class ChainFit:
 
     @property
     def reached(self) -> bool:
-        """Whether the fit has reached its minimum, so that another step would be shorter than one standard error."""
+        """Whether the fit has reached its minimum, that is, whether one more step would be shorter than one standard
+        error.
+        """
         return self.remaining <= DEFAULTS.unfinished
 
 

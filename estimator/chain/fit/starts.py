@@ -74,8 +74,8 @@ def integration_steps(periods: Sequence[SettledPeriod], longest: float) -> int:
 def repeated(period: SettledPeriod) -> Array:
     """Return the weight of each sample (joints, samples), less than 1 for a sample that shares its neighbours' error.
 
-    While a joint sticks, its encoder repeats one reading with one rounding error. If it counted at every sample, that
-    error would make the simulated joint creep towards the reading. Therefore any number of equal readings in a row
+    While a joint sticks, its encoder repeats one reading with one rounding error. If this error counted at every
+    sample, it would make the simulated joint creep towards the reading. Therefore any number of equal readings in a row
     counts as at most REPEATED readings.
     """
     weight = np.ones_like(period.position)

@@ -69,7 +69,9 @@ class _Spectrum:
 
     joint: int
     lines: NDArray[np.complex128]
-    """Jacobian for scaled coordinates (frequencies, coordinates), normalised as in a real orthonormal transform."""
+    """Jacobian for scaled coordinates (frequencies, coordinates), normalised as in an orthonormal real Fourier
+    transform.
+    """
     power: Array
     """Power of the residual (frequencies,); 1 for white noise with the variance that the weights assume."""
     share: Array

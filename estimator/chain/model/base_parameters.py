@@ -56,8 +56,8 @@ class BaseParameters:
     def of(cls, chain: Chain, seed: int = 1, *, tilts: bool = False) -> "BaseParameters":
         """Return the base parameters of this chain.
 
-        tilts: allow for a tilted base, that is, for any direction of gravity. Gravity may then also act on a vertical
-        first joint, so there are more base parameters.
+        tilts: allow for a tilted base, that is, for any direction of gravity. Gravity may then also act on a first
+        joint with a vertical axis, so there are more base parameters.
         """
         anywhere = replace(chain, gravity=tilted(chain.gravity, *GENERIC)) if tilts else chain
         Y = _random_regressor(anywhere, seed)
@@ -117,7 +117,7 @@ def _norms_by_kind(norm: Array) -> Array:
 
 
 def _independent(Y: Array, order: list[int]) -> Columns:
-    """Return the linearly independent columns of `Y`, in which parameters of one kind have comparable columns."""
+    """Return the indices of linearly independent columns of `Y`, which must be scaled by kind of parameter."""
     left = Y[:, order].copy()
     kept: list[int] = []
 

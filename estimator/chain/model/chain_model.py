@@ -93,7 +93,7 @@ class ChainModel:
 
     @property
     def description(self) -> str:
-        """Text that names the friction model, the options and the drive model."""
+        """Short description of the model: its friction, options and drive."""
         words = {"zeros": self.zeros, "torque scales": self.torque_scale, "base tilt": self.base_tilt}
         words |= {"added mass": self.added_mass, "lags": self._has_lags, "back-EMF": bool(self.by_voltage)}
         return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))

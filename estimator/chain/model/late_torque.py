@@ -16,7 +16,7 @@ from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 
 MEANINGS = {"lag_ratio": "ratio of the lag of the joint's current loop to that of joint 1"}
-"""Meanings of the kinds of parameters specific to chains."""
+"""Descriptions of the kinds of parameters that only chains have."""
 PART = 0.1
 """`limited` names a joint's back-EMF if it causes more than this fraction of the largest inertia loss in any motion."""
 MOST_LOST = 0.5

@@ -2,8 +2,8 @@
 
 At each sample, a goal torque is added to the torque of a software spring and damper, which is computed from the angles
 and velocities of the previous sample, as in the real loop. In between, the motion is integrated by the linearly
-implicit Euler method, with the slope of friction at the old velocity. The feedback at every sample keeps the errors of
-this first-order method small.
+implicit Euler method, with the slope of friction evaluated at the old velocity. The feedback at every sample keeps the
+errors of this first-order method small.
 """
 
 import math
