@@ -1,6 +1,6 @@
 """Compiled loops whose disk cache is invalidated by any change in the code or constants compiled into them.
 
-numba stores compiled code next to the source and checks only the date of that one file. Functions and constants inlined
+numba stores compiled code next to the source file and checks only that file's date. Functions and constants inlined
 from other modules could therefore be older than their sources. So the cache is stamped with a hash of the loaded code.
 """
 

@@ -1,4 +1,5 @@
-"""Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, wrong times.
+"""Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, a wrong time
+scale.
 
 As for planar arms (`hil.estimator.baselines.signs`), the torque residual of filtered inverse dynamics with a column
 changed is compared with the residual for the columns as given. Changing the signs and scale factors of torques only

@@ -373,7 +373,7 @@ class Selection:
         return self._left(trial) < self._options.explained_residual**2
 
     def _gain(self, richer: Trial, plainer: Trial) -> float:
-        """Return twice the gain in log-likelihood, with the number of samples reduced for correlation."""
+        """Return twice the gain in log-likelihood, with the number of samples reduced to allow for correlation."""
         assert richer.estimate is not None
         independent = self._samples / colour(richer.estimate.residual)
         return independent * float(np.log(max(self._left(plainer), 1e-12) / max(self._left(richer), 1e-12)))

@@ -37,7 +37,9 @@ class Trial:
     held_out: Array | None
     """RMS error of the open-loop prediction of the held-out motion, relative to that motion's RMS (joints,)."""
     score: float
-    """RMS error of the held-out motion's prediction in units of the noise; without one, the result of `criterion`."""
+    """RMS error of the held-out motion's prediction in units of the noise; without a held-out motion, the result of
+    `criterion`.
+    """
     seconds: float
     coarse: bool = False
     """Whether the fit was allowed to stop early if it left much of the motion unexplained."""

@@ -70,7 +70,7 @@ class Design:
 
 
 class PathDesigner:
-    """Designs paths of one `period` [s], sampled at `rate`, with harmonics up to `highest` [Hz]. Raises
+    """Designs paths that last one `period` [s], sampled at `rate`, with harmonics up to `highest` [Hz]. Raises
     ExcitationError.
 
     friction: typical Coulomb friction (joints,) [N m].

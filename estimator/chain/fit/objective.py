@@ -76,7 +76,7 @@ class ChainProblem:
     that the prior still decides what the data do not determine.
     """
     added: tuple[Array | None, ...] = ()
-    """Known base parameters of the mass added in each period (base parameters,) [SI]; None if there was none."""
+    """Base parameters of the known mass added in each period (base parameters,) [SI]; None if none was added."""
     latest: _Latest = field(repr=False, compare=False, default_factory=_Latest)
 
     @property

@@ -41,7 +41,7 @@ def fit_lines(
 ) -> ChainLinear:
     """From settled periods, estimate the parameters in which the torque is linear.
 
-    added: known base parameters of the mass added to the arm in each period (base parameters,) [SI]; None if none was
+    added: base parameters of the known mass added to the arm in each period (base parameters,) [SI]; None if none was
     added.
     """
     lines = [lines_of(period.filled()) for period in periods]

@@ -337,7 +337,7 @@ def _run_loop(  # noqa: PLR0912
                     _follow(chain, links, p, v1, t, slopes[sample, s], m, gh, columns, work, solve, by, direct)
                     for i in range(n):
                         for j in range(n):
-                            # Derivatives by q and v, and by k through v' = v + h k and through the acceleration.
+                            # Derivatives with respect to q, v, and k (through v' = v + h k and the acceleration).
                             mixed[i, j] = work[6][i, j]
                             mixed[i, n + j] = work[7][i, j] + h * work[6][i, j]
                             mixed[i, 2 * n + j] = h * work[7][i, j] + 2.0 * work[4][i, j]
