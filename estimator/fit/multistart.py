@@ -58,7 +58,8 @@ class Search:
     """The objective with coarse integration steps."""
     options: LikelihoodOptions
     coarse: bool
-    """Whether to stop before full convergence if the residual is well above the noise; this suffices to compare models.
+    """Whether to end fits before full convergence if the residual is well above the noise; this suffices to compare
+    models.
     """
 
     @property

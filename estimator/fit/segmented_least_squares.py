@@ -212,7 +212,7 @@ def minimise_segmented(
                 blocks = _blocks(derivative, shared, own, threads)
                 information, scores, _, _ = blocks.reduced(0.0)
                 information = information + np.diag(prior.precision)
-                freedom = sum(map(np.count_nonzero, rows)) - shared.size - own.size  # residuals of 0 are missing
+                freedom = sum(map(np.count_nonzero, rows)) - shared.size - own.size  # zeros mark missing samples
                 variance = _cost(rows) / max(freedom, 1)
                 return Segmented(shared, own, cost, information, scores, iteration, variance, prior)
     raise ConvergenceError(
@@ -222,7 +222,7 @@ def minimise_segmented(
 
 
 def _cost(rows: Sequence[Array]) -> float:
-    with np.errstate(over="ignore"):  # a motion that diverges costs infinitely much
+    with np.errstate(over="ignore"):  # the cost of a diverging motion is infinite
         return float(sum(np.sum(np.square(row)) for row in rows))
 
 

@@ -65,7 +65,7 @@ def fit_lines(*periods: SettledPeriod, options: LinearOptions = DEFAULTS) -> Lin
     torque = np.concatenate([goal for _, goal in equations], axis=1)
 
     theta, _ = _solve(A, torque, np.ones(joints), options.max_condition)
-    # The second time, each joint is weighted by the residual of the first.
+    # In the second pass, each joint is weighted by its residual in the first.
     left = np.sqrt(np.mean(np.abs(torque - A @ theta) ** 2, axis=1))
     weight = 1.0 / np.maximum(left, 1e-12 * np.abs(torque).max())
     theta, std = _solve(A, torque, weight, options.max_condition)

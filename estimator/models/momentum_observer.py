@@ -63,7 +63,7 @@ FLOOR_SHARE = 0.25
 
 _COUNT = len(NAMES)
 _STANDING = 0.05  # rad/s below which dry friction may hold a joint
-_PLAY_RAD = 0.006  # play of a gear (a data sheet says 0.0044) and encoder noise
+_PLAY_RAD = 0.006  # backlash of a gear (0.0044 in a data sheet) plus encoder noise
 _STAYS_S = 0.03  # time within this play after which the direction of friction counts as unknown
 _STATIC = 1.5  # ratio of static to Coulomb friction
 _CERTAIN = 2.0  # standard deviations to subtract from an estimated torque so that the rest certainly acts
@@ -486,7 +486,7 @@ def _observe_loop(
     return alarm
 
 
-_inner = partial(embedded, _nrt=False)  # nothing in them allocates
+_inner = partial(embedded, _nrt=False)  # none of them allocates memory
 _regressors, _begin_anew, _filter = map(_inner, (_regressors, _begin_anew, _filter))
 _gain, _lacks, _learn = map(_inner, (_gain, _lacks, _learn))
 _keep_dissipative = _inner(_keep_dissipative)

@@ -283,7 +283,7 @@ class Selection:
         return self._left(trial) < self._options.presliding_residual**2
 
     def _converged(self, trial: Trial) -> Trial:
-        """Refit to full precision a trial that stopped early because much remained unexplained."""
+        """Refit, to full precision, a trial that ended early because much of the motion remained unexplained."""
         if not trial.coarse or self._is_explained(trial):
             return trial
         return self._try_or_none(trial.model, trial) or trial

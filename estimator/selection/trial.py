@@ -42,7 +42,7 @@ class Trial:
     """
     seconds: float
     coarse: bool = False
-    """Whether the fit was allowed to stop early if it left much of the motion unexplained."""
+    """Whether the fit was allowed to end early if it left much of the motion unexplained."""
 
     @property
     def has_standard_errors(self) -> bool:
