@@ -1,4 +1,4 @@
-"""Array types used between the estimator's stages."""
+"""Array types exchanged between the estimator's stages."""
 
 import numpy as np
 import numpy.typing as npt

@@ -39,7 +39,7 @@ ADDED = {
 
 @dataclass(frozen=True)
 class KnownMass:
-    """A mass bolted to the last link, on the line from that link's joint through its centre of mass."""
+    """A mass bolted to the last link, on the line from that link's joint through the link's centre of mass."""
 
     mass: float
     """Mass [kg]."""
@@ -106,7 +106,7 @@ def calibrate(
         options: tolerances and limits.
 
     Returns:
-        The ratio of true to assumed torque constant of each joint, and the arm's parameters with the true constants.
+        The ratio of true to assumed torque constant of each joint, and the arm's parameters for the true constants.
 
     Raises:
         ModelError: if the periods differ in their number of joints.

@@ -1,6 +1,6 @@
 """Compiled loops whose disk cache is invalidated by any change in the code or constants compiled into them.
 
-numba stores compiled code next to the source and checks only the date of that one file. Functions and constants inlined
+numba stores compiled code next to the source file and checks only that file's date. Functions and constants inlined
 from other modules could therefore be older than their sources. So the cache is stamped with a hash of the loaded code.
 """
 
@@ -75,7 +75,7 @@ def code_digest(function: Callable[..., Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return the Python function behind a compiled one, or anything else unchanged."""
+    """Return the Python function from which a compiled one was made; return any other value unchanged."""
     return getattr(value, "py_func", value)
 
 
@@ -116,5 +116,5 @@ def _is_own(value: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    """Return a text that identifies a constant; different constants give different texts."""
+    """Return a string that identifies a constant uniquely."""
     return repr(value.tolist()) if isinstance(value, np.ndarray) else repr(value)

@@ -18,7 +18,7 @@ class EstimationError(Exception):
 
 
 class ExcitationError(EstimationError):
-    """A multisine cannot be built: its band is empty, a line is above half the rate, or a peak is not positive."""
+    """A multisine or path cannot be built, for example because its band is empty or no path satisfies the limits."""
 
 
 class RecordingError(EstimationError):
@@ -46,4 +46,4 @@ class ConvergenceError(EstimationError):
 
 
 class PeriodicityError(EstimationError):
-    """The simulated arm does not settle into periodic motion under this multisine."""
+    """The simulated arm does not settle into periodic motion."""

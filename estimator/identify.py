@@ -27,7 +27,7 @@ SETTLING = SettlingOptions()
 class Estimate(FittedParameters):
     """Parameters of the arm estimated from settled periods.
 
-    `std` and `covariance` are the uncertainty due to position errors. They are scaled by the actual residual and
+    `std` and `covariance` describe the uncertainty due to position errors. They are scaled by the actual residual and
     widened if it is correlated (`hil.estimator.fit.covariance`), so they include the true effect of rounding (rounding
     alone leaves a residual of 0.2887 encoder steps RMS). They do not include systematic errors of the torque constant,
     of the encoder's zero or linearity, or of the model. A residual well above 0.29 steps means that the model is
@@ -68,7 +68,7 @@ def identify(
     Args:
         periods: one settled period, or several of the same arm, which are fitted together.
         model: the model to fit.
-        coarse: whether to stop early if the residual is well above the noise; this suffices to compare models.
+        coarse: whether to end the fit early if the residual is well above the noise; this suffices to compare models.
         starts: additional initial guesses, parameters by name [SI], such as those from another experiment or similar
             arms.
         near: point known to be close to a minimum, used as the only initial guess; this is much faster.

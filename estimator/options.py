@@ -66,7 +66,9 @@ class CoordinateOptions:
     bound.
     """
     min_width: float = 1e-3
-    """Minimum distance of a width from its lower bound, as a fraction of that bound, so that it can grow again."""
+    """Minimum distance between a width and its lower bound, as a fraction of that bound, so that the width can grow
+    again.
+    """
     max_relative_increase: float = 2.0
     """Maximum relative increase in a width per iteration."""
 
@@ -106,7 +108,7 @@ class LikelihoodOptions:
     """
 
     ftol: float = 1e-5
-    """Final tolerance: the remaining decrease corresponds to a tenth of a standard error of all parameters together."""
+    """Final tolerance: the remaining decrease corresponds to a combined parameter error of 0.1 standard errors."""
     ftol_refine: float = 3e-4
     """Tolerance for comparing candidate minima."""
     ftol_start: float = 3e-3
@@ -126,7 +128,9 @@ class LikelihoodOptions:
     """Coarse steps, accurate to a few hundredths of an encoder step; they take a third of the time of fine ones."""
     covariance: CovarianceOptions = CovarianceOptions()
     least_inflation: float = 2.0
-    """Factor by which the data's variance must exceed that of independent errors for priors to gain weight."""
+    """Factor by which the data's variance must exceed that of independent errors before the priors are given more
+    weight.
+    """
     least_tempering: float = 1e-4
     """Minimum relative increase in the sum of squares for which the fit is repeated with the heavier priors."""
 
@@ -191,7 +195,7 @@ class ShootingOptions:
     max_step: float = 1e-3
     """Longest integration step of the last fit [s]."""
     coarse_step: float = 2.6e-3
-    """Longest integration step of the earlier fits [s], which are three times as fast as with `max_step`; their errors
+    """Longest integration step of the earlier fits [s]. They run three times as fast as with `max_step`; their errors
     are hundredths of a standard error.
     """
     start_segments: int = 80

@@ -1,4 +1,4 @@
-"""Comparison with other methods on the same settled period, each tuned and timed.
+"""Comparison of other methods, each tuned and timed, on the same settled period.
 
 All methods receive the same positions and commands. Their torque is the command with the delay that hil estimated in
 stage 1, so that none of them has to estimate the delay. Each method is tuned by trying several settings and keeping
@@ -27,7 +27,7 @@ from hil.estimator.selection.prediction import prediction_rms
 CUTOFFS = (6.0, 10.0, 15.0, 25.0, 40.0)  # Hz
 WIDTHS = (0.007, 0.02, 0.05, 0.15)  # rad/s
 VELOCITY_NOISES = (1e-4, 1e-3, 1e-2, 1e-1)  # rad/s per sqrt(s)
-SHORT = 0.5  # s of simulation by which settings are compared
+SHORT = 0.5  # s of simulation over which settings are compared
 PERIODS = 3  # repetitions of the settled period joined end to end for the filters, which need time to converge
 
 Fit = InverseDynamics | Filtered
@@ -36,7 +36,7 @@ Setting = tuple[float, float]
 
 @dataclass(frozen=True)
 class Peer:
-    """Result of one method."""
+    """Result of one of the other methods."""
 
     name: str
     parameters: dict[str, float]
@@ -46,7 +46,7 @@ class Peer:
     seconds: float
     """Run time with the chosen settings [s]."""
     settings: str
-    """The chosen settings, as text."""
+    """Description of the chosen settings."""
     tried: int
     """Number of settings tried."""
 

@@ -1,4 +1,5 @@
-"""Filtered inverse-dynamics least squares (IDIM-LS), the field's standard method, for initial guesses and comparison.
+"""Filtered inverse-dynamics least squares (IDIM-LS), the standard method of the field; used for initial guesses and for
+comparison.
 
 Position is low-pass filtered forwards and backwards and differentiated by central differences, and the regressor is
 evaluated. Regressor and torque are filtered identically and decimated, and one weighted linear least-squares problem is
@@ -28,7 +29,7 @@ WORST_CONDITION = 1e8
 
 @dataclass(frozen=True)
 class Rows:
-    """Filtered regressors and torques, decimated to about the rate at which they contain new information."""
+    """Filtered regressors and torques, decimated roughly to the rate that their bandwidth requires."""
 
     regressor: Array
     """Regressors (joints, samples, parameters)."""
@@ -65,7 +66,7 @@ def uniform(recording: Recording, delay: float = 0.0) -> tuple[Array, Array, flo
 
 
 MoreColumns = Callable[[Array], Array]
-"""Further columns of the regressor (joints, samples, columns) as a function of the positions (joints, samples)."""
+"""Additional regressor columns (joints, samples, columns) as a function of the positions (joints, samples)."""
 
 
 def filtered_rows(
@@ -138,7 +139,7 @@ def fit_inverse_dynamics(
     coulomb_width: width of the smoothed Coulomb step [rad/s].
     delay: delay of the torque [s].
     position_cutoff: cut-off frequency for the positions from which regressors are computed [Hz]; by default `cutoff`.
-    more: further columns of the regressor; their coefficients follow the base parameters and have no names.
+    more: additional regressor columns; their coefficients follow the base parameters and have no names.
     Raises RecordingError, UnidentifiableError.
     """
     rows = [filtered_rows(recording, cutoff, coulomb_width, delay, position_cutoff, more) for recording in recordings]

@@ -1,12 +1,13 @@
-"""Extended and unscented Kalman filters whose state includes the parameters: baselines that use positions only.
+"""Extended and unscented Kalman filters whose state includes the parameters: baselines whose only measurements are
+positions.
 
 State: angles, velocities, base parameters. Between samples the motion is integrated by Runge-Kutta steps under the mean
 motor torque; the parameters are constant except for a little process noise; each sample corrects the whole state. EKF:
 Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with the integrated step's Jacobian from finite
 differences. UKF: Julier and Uhlmann, Proc. IEEE 92 (2004) 401, symmetric sigma points.
 
-The filters are given every fair advantage: the likelihood's dynamics, an initial guess from filtered least squares with
-a realistic spread, several passes over the recording, and noise levels that a caller can tune.
+The filters are given every fair advantage: the same dynamics as the likelihood, an initial guess from filtered least
+squares with a realistic spread, several passes over the recording, and noise levels that the caller can tune.
 """
 
 from collections.abc import Callable
@@ -153,7 +154,7 @@ def _constants(x: Any, scale: Any, slots: Any, fixed: Any, joints: int, p: Any) 
 
 
 def _correct(x: Any, P: Any, R: Any, measured: Any) -> None:
-    """Update `x` and `P` with a position sample, joint by joint, since the joints' errors are independent."""
+    """Update `x` and `P` with a position sample, joint by joint, as the measurement errors are independent."""
     n = x.size
     for j in range(measured.size):
         s = P[j, j] + R[j]
@@ -169,7 +170,7 @@ def _correct(x: Any, P: Any, R: Any, measured: Any) -> None:
 
 
 def _root(P: Any) -> Any:
-    """Return the lower triangular root of a covariance, which rounding may have made slightly indefinite."""
+    """Return the lower-triangular square root of a covariance that rounding may have made slightly indefinite."""
     n = P.shape[0]
     root = np.zeros((n, n))
     for j in range(n):

@@ -25,7 +25,7 @@ class LinearisedEstimate:
     """Base parameters by name [SI]; the friction is purely viscous."""
     std: dict[str, float]
     remark: str
-    """How far each joint swings about the hanging pose, as text."""
+    """Description of how far each joint swings about the hanging pose."""
 
 
 def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) -> LinearisedEstimate:

@@ -24,8 +24,8 @@ LESS_RESIDUAL = 0.6
 """A combination is credible if its residual is below this fraction of the residual with the signs as given."""
 
 SAME_RESIDUAL = 1.05
-"""A combination that also makes a negative inertia or friction positive is credible if its residual is at most
-this multiple of the residual with the signs as given, and explains most of the torque (MOST_LEFT).
+"""A combination that makes a negative inertia or friction positive is credible even if its residual is up to this
+multiple of the residual with the signs as given, provided that it explains most of the torque (MOST_LEFT).
 """
 
 MOST_LEFT = 0.5
@@ -37,14 +37,14 @@ _STANDARD_ERRORS = 3.0
 
 @dataclass(frozen=True)
 class Signs:
-    """A combination of signs of each joint's torque and position (joints,): +1 as given, -1 reversed."""
+    """A combination of signs of each joint's torque and position (joints,): +1 unchanged, -1 reversed."""
 
     torque: tuple[int, ...]
     position: tuple[int, ...]
 
     @property
     def reversed_columns(self) -> tuple[str, ...]:
-        """The reversed columns, as text."""
+        """Descriptions of the reversed columns, such as "the torque of joint 1"."""
         named = [f"the torque of joint {joint}" for joint, sign in enumerate(self.torque, start=1) if sign < 0]
         return (*named, *(f"the position of joint {joint}" for joint, sign in enumerate(self.position, 1) if sign < 0))
 
@@ -94,9 +94,9 @@ class Suspicion:
 
 
 def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
-    """Return the reversal that explains the recordings much better than the given signs; None if there is none.
+    """Return the reversal that explains the recordings much better than the given signs.
 
-    Also returns None if filtered inverse dynamics cannot be solved.
+    Returns None if there is none or if filtered inverse dynamics cannot be solved.
     """
     joints = recordings[0].joints
     given = _fit(recordings, Signs((1,) * joints, (1,) * joints))
@@ -121,8 +121,8 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
 class Absolute:
     """An angle of joint 2 that seems to be measured from a fixed direction instead of from link 1.
 
-    residual, residual_given: relative RMS of the worst joint's torque residual, with the difference between the angles
-    and with the angle as given. turned: angle [rad] that must be added to this difference.
+    residual, residual_given: relative RMS of the worst joint's torque residual, using the difference between the angles
+    and using the angle as given. turned: angle [rad] that must be added to this difference.
     """
 
     residual: float
@@ -131,7 +131,7 @@ class Absolute:
 
 
 def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = ()) -> Absolute | None:
-    """Return evidence that joint 2's angle is absolute; None if this would not explain the recordings much better.
+    """Return evidence that joint 2's angle is absolute; None if that would not explain the recordings much better.
 
     turned: angles [rad] to try adding to the difference, in case the two angles were measured from different
     directions; quarter turns are always tried. If several fit equally well, the first is chosen.
@@ -180,7 +180,7 @@ def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | No
 
 
 def suspect_order(recordings: Sequence[Recording], torques: bool = True) -> tuple[float, float] | None:
-    """Return evidence that the angles of two joints, and by default also their torques, are in the opposite order.
+    """Return evidence that the angles of two joints, and by default also their torques, are swapped.
 
     See `suspect_swapped` for the result.
     """

@@ -1,5 +1,5 @@
 """Detection of motor torques that differ from the torque column (clipped by the drive, timestamped by a different
-clock, or delayed on one joint), and of stops that exert an additional torque.
+clock, or delayed on one joint), and of mechanical stops that exert an additional torque.
 
 As in the detection of reversed columns (`hil.estimator.baselines.signs`), the residual of inverse dynamics for the
 torque as given is compared with that for a modified torque.
@@ -21,12 +21,12 @@ from hil.estimator.errors import EstimationError
 BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
 """Clipping levels to try, each given as the fraction of samples that exceed it."""
 OUTERMOST = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4])
-"""Angles of a stop to try, each given as the fraction of samples beyond it."""
+"""Angles at which to try a mechanical stop, each given as the fraction of samples beyond it."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
 LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
 FEWEST_STEPS = 2  # sampling intervals between the best delays of two joints
-UNEVEN = 0.85  # ratio of a joint's residual at its best delay to that at the other joint's, below which they differ
+UNEVEN = 0.85  # ratio of a joint's residuals at its best delay and at the other joint's, below which these differ
 EXPLAINED = 0.3  # relative residual of each joint at its best delay, above which the torque does not fit at all
 EVALUATIONS = 30  # of the search for delay and drift
 MOST_SAMPLES = 30_000  # more would take too long
@@ -34,8 +34,8 @@ MOST_SAMPLES = 30_000  # more would take too long
 
 @dataclass(frozen=True)
 class Clipped:
-    """A joint whose torque seems limited to `level` [N m], although the torque column exceeds it in a fraction `beyond`
-    of the samples.
+    """A joint whose torque seems limited to `level` [N m], although the torque column exceeds it in the fraction
+    `beyond` of the samples.
 
     residual, residual_given: relative RMS of the joint's torque residual, with the limit and with the torque as given.
     """
@@ -49,7 +49,7 @@ class Clipped:
 
 @dataclass(frozen=True)
 class Stop:
-    """A yielding stop or object that a joint seems to press against beyond the angle `at` [rad].
+    """A yielding mechanical stop or object that a joint seems to press against beyond the angle `at` [rad].
 
     side: 1 if the joint touches it at larger angles, -1 if at smaller ones. stiffness: N m/rad.
     residual, residual_given: relative RMS of the joint's torque residual, with the stop and without it.
@@ -132,7 +132,9 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
 
 
 def suspect_stop(recordings: Sequence[Recording]) -> Stop | None:
-    """Return the stop that explains the motion much better than the torque alone or springs; None if there is none."""
+    """Return the mechanical stop that explains the motion much better than both the torque alone and springs; None if
+    there is none.
+    """
     joints = recordings[0].joints
     given, sprung = _residuals(recordings), _residuals(recordings, _springs)
     if given is None or sprung is None:
@@ -153,7 +155,7 @@ def suspect_stop(recordings: Sequence[Recording]) -> Stop | None:
 
 
 def _pressing(joint: int, at: float, side: int, positions: Array) -> Array:
-    """Return the regressor's column for a stop (joints, samples, 1)."""
+    """Return the regressor's column for a mechanical stop (joints, samples, 1)."""
     column = np.zeros((*positions.shape, 1))
     column[joint, :, 0] = side * np.maximum(side * (positions[joint] - at), 0.0)
     return column
@@ -165,9 +167,7 @@ def _springs(positions: Array) -> Array:
 
 
 def suspect_late(recordings: Sequence[Recording]) -> Late | None:
-    """Return the joint whose torque has a delay of its own, if this explains the motion much better than a common
-    delay.
-    """
+    """Return the joint whose torque has a separate delay, if this explains the motion much better than a common one."""
     joints = recordings[0].joints
     if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
         return None
@@ -219,7 +219,9 @@ def _delayed(recording: Recording, delays: Array) -> Recording:
 
 
 def suspect_drift(recordings: Sequence[Recording]) -> ClockDrift | None:
-    """Return the drift of the torque's delay if it explains the motion much better than a constant delay, or None."""
+    """Return the drift of the torque's delay if it explains the motion much better than a constant delay, otherwise
+    None.
+    """
     from scipy.optimize import minimize
 
     if sum(each.time.size for each in recordings) > MOST_SAMPLES:

@@ -62,7 +62,7 @@ def choose_chain(
 ) -> ChainChoice:
     """Fit `model`, and richer models if its residual exceeds the noise; choose the best-supported estimate.
 
-    Raises whatever `identify_chain` raises for `model` itself.
+    Raises any error that `identify_chain` raises for `model` itself.
     """
     started = time.perf_counter()
     best = identify_chain(periods, model, prior, test_zeros=True)
@@ -99,9 +99,9 @@ def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, 
 
 
 def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) -> float:
-    """Return the increase in twice the log likelihood beyond that expected by chance, with unknown noise levels.
+    """Return twice the gain in log likelihood minus the value expected by chance, for unknown noise levels.
 
-    The residual's correlation is taken from the richer model, since what the simpler one omits is not noise.
+    The residual's correlation is taken from the richer model, since terms missing from the simpler one are not noise.
     """
     before, after = (np.nansum(np.square(each.residual), axis=1) for each in (simple, rich))
     samples = np.isfinite(simple.residual).sum(axis=1)

@@ -1,8 +1,9 @@
-"""Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, wrong times.
+"""Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, a wrong time
+scale.
 
 As for planar arms (`hil.estimator.baselines.signs`), the torque residual of filtered inverse dynamics with a column
-changed is compared with the residual for the columns as given. Signs and factors of torques only change how the joints'
-normal equations are added up, so all combinations can be tried.
+changed is compared with the residual for the columns as given. Changing the signs and scale factors of torques only
+changes how the joints' normal equations are combined, so all combinations can be tried.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,18 +28,18 @@ from hil.estimator.errors import EstimationError, RecordingError
 SUSPICIOUS = 0.1  # relative torque residual of the worst joint, below which only contradictory torques are sought
 CLEAR = 0.5  # largest ratio of the worst joint's residuals, with a change and as given
 WELL = 0.3  # largest relative residual with a change
-GAIN = 0.03  # decrease in the residual's logarithm, mean of the joints, that makes factors of the torques credible
+GAIN = 0.03  # minimum decrease in the log residual, averaged over the joints, for credible torque factors
 AS_WELL = 1.05  # ratio of the residuals up to which fewer reversals are preferred
-EQUALLY_FAR = 4.0  # difference of squared distances from the description that decides between two reversals
+EQUALLY_FAR = 4.0  # difference in squared distance to the description that decides between two reversals
 SIGNIFICANT = 3.0  # standard errors
 FACTORS = np.exp(np.linspace(-np.log(6.0), np.log(6.0), 41))  # torque factors that are tried
 STEPS = 1.0 + 0.08 * np.linspace(-1.0, 1.0, 17)  # by which the best factor is refined
-RIDGE = 1e-12  # added to normal equations of unit diagonal, so that a joint that hardly moves leaves them regular
+RIDGE = 1e-12  # added to normal equations of unit diagonal, so that they stay nonsingular if a joint hardly moves
 SWEEPS = 3  # over the joints
 DELAYS = 0.005 * np.arange(-12, 13)  # s: delays of the torques that are tried
 LEAST_LATE = 0.01  # s
 LATE = 0.6  # largest ratio of a joint's residuals, with a delay and as given
-ONE_LATE = 0.3  # decrease in the logarithms of residuals, beyond a common delay's, that makes one joint's credible
+ONE_LATE = 0.3  # decrease in the log residuals, beyond that of a common delay, that makes a delay of one joint credible
 TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 10.0])  # factors that are tried
 
 
@@ -47,8 +48,8 @@ class Reversed:
     """Reversed columns.
 
     residuals: relative RMS of the worst joint's torque residual with the change and without it.
-    impossible: whether friction is negative with the columns as given. This happens if all torques are reversed, or
-    the columns of a vertical first joint.
+    impossible: whether friction is negative with the columns as given. This happens if all torques, or columns of a
+    first joint with a vertical axis, are reversed.
     """
 
     residuals: tuple[float, float]
@@ -60,7 +61,7 @@ class Reversed:
 
 @dataclass(frozen=True)
 class WrongTimes:
-    """Times that are `factor` times the true ones. residuals: as for reversed columns."""
+    """Recorded times that are `factor` times the true times. residuals: as for reversed columns."""
 
     residuals: tuple[float, float]
     factor: float
@@ -91,19 +92,21 @@ class _Solved:
     value: Array
     std: Array
     relative: Array
-    """RMS of the torque residual relative to the torque (joints,)."""
+    """RMS of the torque residual relative to that of the torque (joints,)."""
 
     @property
     def worst(self) -> float:
         return float(self.relative.max())
 
     def distance(self, prior: Prior) -> float:
-        """Squared distance of the base parameters from those of the description, in the prior's standard deviations."""
+        """Squared distance between the base parameters and the description's, in units of the prior's standard
+        deviations.
+        """
         return float(np.sum(np.square((self.value[: prior.value.size] - prior.value) / prior.std)))
 
     @property
     def misfit(self) -> float:
-        """Negative log likelihood, up to a constant, with each joint's torque in its own unit."""
+        """Negative log likelihood, up to a constant, with each joint's torque scaled by its RMS."""
         return float(np.log(self.relative).sum())
 
 
@@ -119,7 +122,7 @@ class ColumnCheck:
 
     @classmethod
     def of(cls, recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> "ColumnCheck | None":
-        """Return a check of the recordings, filtered as in the regression; None if they are too short for that."""
+        """Return a check of the recordings, filtered as in the regression; None if they are too short to filter."""
         for cutoff in CUTOFFS:
             with suppress(RecordingError):
                 check = cls(recordings, model, prior, cutoff, LAG)
@@ -218,7 +221,8 @@ class ColumnCheck:
         return Late(residuals, chosen, late) if is_late and residuals[0] < LATE * residuals[1] else None
 
     def contradictory_torques(self) -> tuple[float, ...] | None:
-        """Return torque factors relative to joint 1's (joints,) if they explain the recordings better than equal ones.
+        """Return torque factors relative to joint 1's (joints,) if they explain the recordings better than equal
+        factors.
 
         The links' prior is weak and friction absorbs much of an error, so even a small improvement is evidence.
         """
@@ -237,7 +241,7 @@ class ColumnCheck:
         return tuple(factors.tolist())
 
     def wrong_times(self) -> WrongTimes | None:
-        """The time scale that, given gravity and the described geometry, explains the recordings much better than 1."""
+        """The time scale that explains the recordings much better than 1, given gravity and the described geometry."""
         given = self._given[1]
         if not np.any(self.model.base.chain.gravity):
             return None
@@ -258,9 +262,8 @@ class ColumnCheck:
             return np.inf
 
     def _dissipates_too_little(self, found: _Solved) -> bool:
-        """Whether too many friction terms are significantly negative.
-
-        That is, more than are significantly positive, or all those of one joint.
+        """Whether more friction terms are significantly negative than significantly positive, or all terms of one joint
+        are significantly negative.
         """
         start, joints = self.model.base.count, self.model.joints
         over = (found.value / found.std)[start : start + 2 * joints].reshape(2, joints)
@@ -317,7 +320,7 @@ def _driven(columns: Array, torque: Array) -> tuple[Array, Array]:
 
 
 def _turned(joints: int) -> Iterator[tuple[int, ...]]:
-    """Yield the angle signs to try: as given, one joint's reversed, all reversed."""
+    """Yield the angle signs to try: unchanged, reversed for one joint, reversed for all joints."""
     yield (1,) * joints
     for joint in range(joints):
         yield tuple(-1 if each == joint else 1 for each in range(joints))

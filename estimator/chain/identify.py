@@ -37,10 +37,10 @@ the torque, raises it to 2 or 3; with a noisy encoder, load-dependent friction o
 
 SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005
 """Significance level for errors of fixed encoder zeros, and the smallest reported error [rad]: three encoder steps,
-less than the usual error of an adjusted zero.
+less than the usual error of a manually adjusted zero.
 """
 
-BELIEVED = 0.5  # standard errors under white noise above this fraction of the prior's: values come from the prior
+BELIEVED = 0.5  # values whose standard error under white noise exceeds this fraction of the prior's come from the prior
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class ChainEstimate(FittedParameters):
     outliers: int
     correlation_time: float
     systematic: float
-    """Largest ratio of the base parameters' standard errors to those under white noise: how far model errors exceed
+    """Largest ratio of a base parameter's standard error to that under white noise: how far model errors exceed the
     noise at the frequencies that determine the parameters.
     """
     softness: float
@@ -87,7 +87,7 @@ class ChainEstimate(FittedParameters):
 
     @property
     def explained(self) -> bool:
-        """Whether the residual is noise alone, so that no further term needs to be tried."""
+        """Whether the residual consists of noise only, so that no further term needs to be tried."""
         return float(self.over_noise.max()) <= EXPLAINED_RESIDUAL and self.systematic <= SYSTEMATIC
 
 
@@ -116,7 +116,8 @@ def identify_chain(
     fit = _best_fit(used, model, linear, prior, replace(DEFAULTS, test_zeros=test_zeros), added)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     count = model.base.count
-    # The weight of the prior in the result; model errors or an unfinished fit widen the standard errors, not this.
+    # White-noise errors show how far the values depend on the prior; model errors and an unfinished fit do not alter
+    # this.
     std = np.sqrt(np.diag(fit.white_covariance))
     systematic = largest_ratio(np.sqrt(np.diag(fit.covariance))[:count], std[:count])
     wide = std[:count] > BELIEVED * prior.std

@@ -2,7 +2,7 @@
 
 Stage 1 is filtered inverse dynamics. Stage 2 is the same likelihood as for settled periods: its observer needs
 commanded torque, but no periodic motion. A simulation driven by a measured torque adds no information (docs/theory.md);
-in that case the regression's result is returned, and marked as such.
+in that case, the result is that of the regression and is marked as such.
 """
 
 from collections.abc import Sequence
@@ -26,9 +26,9 @@ from hil.estimator.errors import ModelError, RecordingError
 from hil.estimator.fit.covariance import autocorrelation
 from hil.estimator.models.conflicts import Conflict
 
-CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the regression: the first that the recordings' rate and length allow
+CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the regression: the first one that the recordings' rate and length allow is used
 LAG = 1e-3  # s: typical lag of a current loop, assumed by the regression
-MOVES = 0.05  # mean size of the smoothed direction of motion, below which a joint stands still
+MOVES = 0.05  # mean absolute smoothed sign of velocity below which a joint counts as standing still
 VELOCITY_SAMPLES = 9  # at the beginning, from which the initial velocity is taken
 
 

@@ -28,7 +28,7 @@ class PeriodicMotion:
 
 
 def lines_of(signal: Array) -> Lines:
-    """Return the coefficients c_k (..., samples // 2 + 1) of a period (..., samples), the sum of c_k exp(j k w0 t)."""
+    """Return the coefficients c_k (..., samples // 2 + 1) of a period (..., samples): the sum of c_k exp(j k w0 t)."""
     return np.asarray(np.fft.rfft(signal, axis=-1) / signal.shape[-1])
 
 
@@ -70,7 +70,7 @@ def without_jump(position: Array) -> Array:
 
 
 def slow_part(position: Array, lines: int) -> Array:
-    """Return the part of a period (joints, samples) described by its first `lines` Fourier coefficients, as samples."""
+    """Return the part of a period that its first `lines` Fourier coefficients describe (joints, samples)."""
     kept = np.fft.rfft(position, axis=1)
     kept[:, lines:] = 0.0
     return np.asarray(np.fft.irfft(kept, position.shape[1], axis=1))
@@ -99,9 +99,9 @@ def interpolated_noise(valid: Mask) -> Array:
 
 
 def _jump(position: Array) -> Array:
-    """Return the gap between the ends of a period (joints, samples), less the motion between two samples (joints,).
+    """Return the gap between the ends of a period (joints, samples) minus the motion between two samples (joints,).
 
-    At low rates a joint moves by many encoder steps from the last sample of a period to the first of the next.
+    At low rates, a joint moves by many encoder steps from the last sample of a period to the first of the next.
     """
     if position.shape[1] < len(_AHEAD):
         return np.zeros(len(position))

@@ -1,4 +1,4 @@
-"""A settled period as a recording, for methods that need not know that it repeats."""
+"""A settled period as a recording, for methods that do not exploit its periodicity."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Whether an arm has settled: the difference between successive periods of a periodic experiment."""
+"""Differences between successive periods of a periodic experiment, which show whether the arm has settled."""
 
 import itertools
 import math
@@ -17,12 +17,12 @@ WARMEST = 0.25  # largest change from period to period while friction warms up
 ALIKE = (
     0.8  # minimum correlation of successive changes while friction warms up, as it always changes in the same direction
 )
-MOST_PERIODS = 100  # more would not be useful advice
+MOST_PERIODS = 100  # advice to use more would not be helpful
 
 
 @dataclass(frozen=True)
 class Settling:
-    """RMS difference of each period from the previous one."""
+    """RMS difference between each period and the previous one."""
 
     difference: Array
     """RMS difference (periods - 1, joints) [rad]."""
@@ -49,7 +49,7 @@ def period_difference(position: Array) -> Settling:
 
 
 def settling_difference(former: Array, latest: Array) -> float:
-    """Return the RMS difference of a period (joints, samples) [rad] from the previous one, relative to the motion's
+    """Return the RMS difference between a period (joints, samples) [rad] and the previous one, relative to the motion's
     RMS.
 
     The value is that of the worst joint. Only the second halves are compared. If they agree, the latest period is
@@ -79,8 +79,8 @@ class Decay:
 
 
 def decay_of(differences: Sequence[float], within: float) -> Decay | None:
-    """Return the decay of the relative differences of successive periods, and how many periods it takes to reach
-    `within`.
+    """Return the decay of the relative differences between successive periods, and the number of periods it takes to
+    reach `within`.
 
     Returns None if the differences do not decrease steadily.
 
@@ -115,7 +115,7 @@ def correlation_of_changes(position: Array) -> float:
 
 
 def _rms(values: Array) -> Array:
-    """Return the RMS over the last axis, ignoring NaN; infinite if nothing is left."""
+    """Return the RMS over the last axis, ignoring NaN; infinite if all values are NaN."""
     seen = np.isfinite(values)
     count = seen.sum(axis=-1)
     total = np.sum(np.where(seen, values, 0.0) ** 2, axis=-1)

@@ -15,7 +15,7 @@ FEWEST_SAMPLES = 32
 LEAST_VALID = 0.5  # minimum fraction of a joint's samples that must be valid
 LEAST_MOTION = 4.0  # minimum range of motion in encoder steps
 MOST_GAP = 0.2  # s between samples; with longer intervals the motion would not be resolved
-MOST_INTERVALS, SHORTEST_GAP = 8.0, 0.04  # intervals longer than this many usual ones, and this many seconds, are gaps
+MOST_INTERVALS, SHORTEST_GAP = 8.0, 0.04  # gaps exceed both this many typical intervals and this many seconds
 LONGEST_GAP = 10.0  # s within one recording
 LEAST_NOISE = 1e-5  # rad: lower bound for any arm's encoder
 MOST_ANGLE = 200.0  # rad: larger values must be degrees or encoder steps
@@ -113,7 +113,8 @@ class Recording:
 
 
 def _white_noise(time: Array, row: Array) -> float:
-    """Return the standard deviation of white noise [rad], from fourth-order differences of neighbouring samples.
+    """Return the standard deviation of white noise [rad], estimated from fourth-order differences of neighbouring
+    samples.
 
     The median over the recording is used, since motion too fast for a cubic makes up only a small part of it.
     """
@@ -208,8 +209,8 @@ def _check_motion(recording: Recording) -> None:
         step = np.abs(np.diff(row))
         speed = step / np.diff(recording.time)
         k = int(np.argmax(speed))
-        is_turn = abs(step[k] - 2.0 * np.pi) < 0.5  # even if a turn back follows: the angle wraps
-        # In a wrong unit, any small movement may look like an outlier.
+        is_turn = abs(step[k] - 2.0 * np.pi) < 0.5  # the angle wraps, even if it then wraps back
+        # In the wrong unit, any small movement may look like an outlier.
         if speed[k] > MOST_SPEED and not is_turn and (step[k] > MOST_ANGLE or swing <= MOST_ANGLE):
             for at in {k, k + 1} - {0, row.size - 1}:
                 if abs(row[at + 1] - row[at - 1]) < 0.2 * min(step[at - 1], step[at]):

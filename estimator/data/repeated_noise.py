@@ -1,9 +1,9 @@
 """Noise of the angles, estimated from the difference between two passes of the same periodic motion.
 
-Whatever repeats with the motion cancels. Without noise, both passes are rounded identically and nothing remains; the
-more noise there is before rounding, the more the rounding errors differ. With independent Gaussian noise of standard
-deviation s, a slow drift d from one pass to the next, and angles spread evenly over the steps, half the mean square of
-the difference at high frequencies is
+Everything that repeats with the motion cancels. Without noise, both passes are rounded identically and the difference
+is zero; the more noise there is before rounding, the more the rounding errors differ. With independent Gaussian noise
+of standard deviation s, a slow drift d from one pass to the next, and angles spread evenly over the steps, half the
+mean square of the difference at high frequencies is
 
     s^2 + 1/12 - sum over k of exp(-(2 pi k s)^2) cos(2 pi k d) / (2 pi^2 k^2)   [steps^2],
 
@@ -29,7 +29,7 @@ __all__ = ["agreed_noise", "coloured_noise", "repeated_noise"]
 FEWEST = 20  # samples of a pass; at 20 Hz, half a period of 2 s
 ROUNDING = 1.0 / 12.0  # steps^2
 AGREE = 2.0  # standard errors
-_LINES = 8.0  # samples of a period per line from which its noise is measured
+_LINES = 8.0  # number of samples of a period per line used to measure its noise
 _LINE_ERROR = 0.72  # relative standard error of the noise from the median power of one line
 _STD = np.linspace(0.0, 1.0, 401)
 _ORDERS = np.arange(1, 30)
@@ -55,7 +55,7 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
         averaged: number of passes averaged to obtain the sample.
 
     Returns:
-        The standard deviations; None for fewer than two passes, or if they are too short.
+        The standard deviations; None if there are fewer than two passes or the passes are too short.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None
@@ -71,7 +71,7 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
 
 
 def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> Array | None:
-    """Return the standard deviation of the noise of one averaged sample in excess of white noise (joints,) [rad].
+    """Return the standard deviation of one averaged sample's noise in excess of white noise (joints,) [rad].
 
     It is 0 unless significant. At low frequencies, where the motion may have changed from pass to pass, the noise is
     extrapolated: its ratio to the noise in the octave above is assumed to equal the ratio between that octave and the
@@ -82,7 +82,7 @@ def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
         return None
     found = [[_excess(*joint) for joint in zip(*each, strict=True)] for each in pairwise(passes)]
     excess, fast = 0.5 * np.mean(found, axis=0).T
-    # Most of the rounding error may repeat, so that small changes in the motion stand out against what is left of it.
+    # If most of the rounding error repeats, even small changes in the motion exceed what remains of it.
     known = np.maximum(fast, ROUNDING * step**2)
     error = known * np.sqrt(2.0 * (0.75 + 0.75**2 / 0.25) / passes[0].shape[1])
     noise: Array = np.sqrt(np.where(excess > _SURE * error, excess / averaged, 0.0))
@@ -90,7 +90,7 @@ def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
 
 
 def _excess(former: Array, later: Array) -> tuple[float, float]:
-    """Return the excess power and the white-noise power in the difference of two passes (samples,).
+    """Return the excess power and the white-noise power in the difference between two passes (samples,).
 
     The excess is the power beyond that of white noise.
     """
@@ -105,7 +105,7 @@ def _excess(former: Array, later: Array) -> tuple[float, float]:
     if 4 * slow > _fastest(power) or not valid.any():
         return 0.0, fast
     excess = float(_beyond_fast(power, slow)[0])
-    if not valid.all():  # interpolation leaves less of fast noise than of slow noise
+    if not valid.all():  # interpolation attenuates fast noise more than slow noise
         like = _spectrum(interpolated_noise(valid))
         excess -= fast * float(np.mean(_beyond_fast(like, slow)) / np.mean(like[:, _fastest(like) :]))
     return excess, fast
@@ -140,12 +140,12 @@ def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:
     """Return the noise (joints,) [rad] from two upper bounds on it: their mean if they agree, otherwise the smaller
     one.
 
-    Each bound is the median of a few lines and has an error of its own, so taking the smaller of two that agree would
+    Each bound is the median of a few lines and therefore uncertain, so taking the smaller of two that agree would
     underestimate the noise.
 
     Args:
         white: bound from the highest lines of a period of `samples` samples (joints,) [rad].
-        repeated: bound from the difference of two halves of such periods (joints,) [rad], if known.
+        repeated: bound from the difference between two halves of such periods (joints,) [rad], if known.
         samples: number of samples of the period.
     """
     if repeated is None:

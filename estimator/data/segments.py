@@ -14,7 +14,7 @@ Indices = npt.NDArray[np.int64]
 
 LONGEST_STEP = 1e-3  # s
 FEWEST = 8
-"""Fewest samples in a segment."""
+"""Minimum number of samples in a segment."""
 START_WINDOW = 0.03  # s before and after a segment's start, used to estimate its initial state
 DIFFERENCE = 1e-7  # s
 
@@ -73,7 +73,7 @@ class Grid:
 def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[RecordingSegment]:
     """Cut a recording into equal pieces of about `length` [s]; `number` is the recording's index.
 
-    Pieces in which the recording has a gap are left out. Raises RecordingError if no piece contains FEWEST samples.
+    Pieces in which the recording has a gap are omitted. Raises RecordingError if no piece contains FEWEST samples.
     """
     steps = len(grid.edges) - 1
     pieces = max(1, round(steps * grid.step / length))
@@ -133,8 +133,8 @@ def _lagging(torque: Array, step: float, lag: float) -> Array:
 def grid_torque_slopes(recording: Recording, grid: Grid, delays: Array, lags: Array) -> Array:
     """Differentiate `grid_torque` with respect to each joint's delay and lag (2, joints, steps) [N m/s].
 
-    Central differences are used. If any joint has no lag, the derivatives with respect to lag are taken to equal those
-    with respect to delay, as they do for a tiny lag.
+    Central differences are used. If any joint has no lag, the derivatives with respect to lag are set equal to those
+    with respect to delay, which is the limit for a small lag.
     """
 
     def by(delay: Array | float, lag: Array | float) -> Array:

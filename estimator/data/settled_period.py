@@ -14,8 +14,8 @@ from hil.estimator.simulation.closed_loop import Stabilised
 Indices = npt.NDArray[np.intp]
 
 FEWEST_SAMPLES = 32
-SPIKE = 8.0  # deviation from the local median, in typical deviations, above which a reading is a spike
-MOST_SPIKES = 0.05  # fraction of spikes above which they are the motion itself
+SPIKE = 8.0  # deviation from the local median, relative to the typical one, above which a reading is a spike
+MOST_SPIKES = 0.05  # fraction of spikes above which they are assumed to be real motion
 LEAST_VALID = 0.5  # minimum fraction of a joint's samples that must be valid
 LEAST_MOTION = 4.0  # minimum range of motion in encoder steps
 MOST_GAP = 4.0  # allowed gap from the last sample to the first, relative to the largest change between neighbours
@@ -62,8 +62,8 @@ class SettledPeriod:
     before: Array | None = None
     """Angles and velocities one period before the first sample (2, joints) [rad, rad/s], from encoder readings.
 
-    A motion counts as settled if it differs little from the previous period's; the rest of the transient can be
-    predicted from this state.
+    A motion counts as settled if it differs little from that of the previous period; what remains of the transient can
+    be predicted from this state.
     """
     valid: Mask = field(init=False)
     """Whether each sample was received (joints, samples)."""
@@ -109,13 +109,13 @@ class SettledPeriod:
 
 
 def without_spikes(period: SettledPeriod) -> SettledPeriod:
-    """Return the period with isolated outliers (such as bit errors cause) marked as missing.
+    """Return the period with isolated outliers (caused by bit errors, for example) marked as missing.
 
     Two distances are computed for each reading: from the median of itself and two neighbours on either side, and from a
     cubic through its neighbours. The reading is an outlier if both exceed SPIKE encoder steps and SPIKE times the
     typical distance from the median. At a low sampling rate, the median alone would mistake every fast reversal for an
-    outlier. If more than the fraction MOST_SPIKES would be marked, none are, since the joint must be moving fast
-    for this sample rate.
+    outlier. If more than the fraction MOST_SPIKES would be marked, none are, since the joint is then moving too fast
+    for this sampling rate.
     """
     from scipy.ndimage import median_filter
 
@@ -196,7 +196,8 @@ def _check_motion(period: SettledPeriod) -> None:
     filled = period.filled()
     for joint, row in enumerate(filled):
         gap = abs(float(row[0] - row[-1]))
-        # Friction that changes as the arm warms up leaves a gap; it does no harm, as the initial state is estimated.
+        # Friction that changes as the arm warms up leaves a gap. This does no harm, since the initial state is
+        # estimated.
         most = max(MOST_GAP * float(np.abs(np.diff(row)).max()), MOST_DRIFT * float(np.ptp(row)))
         if gap > most:
             raise RecordingError(

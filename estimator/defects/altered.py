@@ -19,12 +19,12 @@ from hil.estimator.options import ShootingOptions
 OPTIONS = ShootingOptions()
 QUICK = ShootingOptions(ftol=1e-3, max_step=OPTIONS.coarse_step, reweightings=1)
 HOPELESS = 100.0  # mean square of the residual relative to the noise above which a fit is not refined
-IGNORED = 1e-3  # weight of a segment in which a sudden change happens
+IGNORED = 1e-3  # weight of a segment in which a sudden change occurs
 
 
 @dataclass(frozen=True)
 class AlteredFit:
-    """Result of a fit.
+    """Result of a fit with or without a defect.
 
     values: parameters by name [SI]. unknowns: values of the defect's unknowns. left: mean square of the residual in
     units of the noise.
@@ -86,7 +86,7 @@ class Altered:
 
     def direction(self, hypothesis: Hypothesis) -> Array:
         """Change in the parameters `names` per unit of each unknown (names, unknowns), as in `Direction`."""
-        if hypothesis.kind == "scale":  # the origin of the angles is unknown
+        if hypothesis.kind == "scale":  # the angle that scaling leaves unchanged is unknown
             zeros = [name for name in self.names if kind_of(name) == "zero"]
             return np.array([[float(name == zero) for zero in zeros] for name in self.names])
         return np.array([[each.get(name, 0.0) for each in hypothesis.directions] for name in self.names])
@@ -120,7 +120,8 @@ class Altered:
         with suppress(ConvergenceError):
             ends.append(posed.minimum(posed.begun(estimate.value, unknowns), estimate.own))
             unknowns = ends[0].shared[ends[0].shared.size - posed.unknowns :]
-        # Friction at low speed was fitted to a recording with the defect, which may have led to a local minimum.
+        # Friction at low speed was fitted to a recording that has the defect, so this fit may have ended in a local
+        # minimum.
         without = None if hypothesis is None else self._without(hypothesis, unknowns)
         if without is not None:
             with suppress(ConvergenceError):

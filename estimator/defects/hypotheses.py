@@ -23,7 +23,7 @@ Direction = Mapping[str, float]
 MOST_STEPS = 24  # instants at which a sudden change is tried
 EDGE = 2  # segments before and after a sudden change
 DECAYS = (0.15, 0.4, 1.0)  # time constants, relative to the duration of the longest recording
-MOST_RECORDINGS = 4  # each of which is compared with the others
+MOST_RECORDINGS = 4  # each is compared with the others
 TORQUE_UNITS = ("kg m^2", "N m", "N m s/rad", "N m/rad")
 
 
@@ -50,9 +50,9 @@ class Hypothesis:
     directions: tuple[Direction, ...]
     """One direction per unknown; empty for angle scales, which have one unknown per joint."""
     strength: Array
-    """Strength of the defect in each segment (segments,), which follows from its course."""
+    """Strength of the defect in each segment (segments,), determined by its course."""
     used: Mask
-    """Whether each segment is used (segments,): all but the one in which a sudden change happens."""
+    """Whether each segment is used (segments,): all but the one in which a sudden change occurs."""
 
     @property
     def is_absolute(self) -> bool:
@@ -70,7 +70,7 @@ def hypotheses(
     """Return all defects to test. values: parameters by name [SI]; gravity: whether it acts on the arm."""
     joints = recordings[0].joints
     always = np.ones(len(segments))
-    # Without gravity, the scale of the first joint's angle is that of its inertia and friction.
+    # Without gravity, the scale of the first joint's angle cannot be separated from that of its inertia and friction.
     single = [(joint,) for joint in range(1 if gravity else 2, joints + 1)]
     scaled = [*single, *([tuple(range(1, joints + 1))] if len(single) > 1 else [])]
     found = [Hypothesis("scale", which, Course("always"), (), always, always > 0.0) for which in scaled]
@@ -109,7 +109,7 @@ def _changes(
 
 
 def _load(joints: int) -> tuple[Direction, ...]:
-    """Return the effects of a mass anywhere on the last link; with two joints, its moments act on the second joint."""
+    """Return the effects of a mass anywhere on the last link; its first moment changes gravity_2 and coupling alike."""
     if joints == 1:
         return ({"inertia_1": 1.0}, {"gravity_1": 1.0})
     return ({"inertia_1": 1.0}, {"gravity_1": 1.0}, {"gravity_2": 1.0, "coupling": 1.0}, {"inertia_2": 1.0})

@@ -24,7 +24,7 @@ from hil.estimator.selection.candidates import colour
 FEWEST_SEGMENTS = 6
 MOST_SEGMENTS = 400  # more would take too long
 EXPLAINED = 1.2  # mean square of the residual, relative to the noise
-FITTED = 3  # hypotheses, each of another kind or joint
+FITTED = 3  # number of hypotheses, which differ in kind or joint
 PROMISING = 0.45  # fraction of the residual beyond the noise: a hypothesis below it is dropped
 CERTAIN = 2.0  # decrease in the sum of squares relative to that expected by chance
 LEAST = {"scale": 0.01, "load": 0.02, "friction": 0.04, "torque": 0.01, "offset": 0.01, "arm": 0.03}
@@ -58,7 +58,7 @@ class _Score:
 
 
 def probable_defect(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool) -> Defect | None:
-    """Return the most probable defect, if one is significant and large enough to matter.
+    """Return the most probable defect if it is significant and large enough to matter, otherwise None.
 
     estimate: fit of a model without terms that could imitate a defect. gravity: whether gravity acts on the arm.
     """
@@ -84,7 +84,7 @@ def _searched(altered: Altered, every: Sequence[Hypothesis]) -> Defect | None:
     if found.fit.left > EXPLAINED:
         near = [found.hypothesis, *_neighbours(found.hypothesis, every)]
         found = _best(altered, near, given, linear.independent) or found
-    # Hypotheses with the change in different segments were compared on different data.
+    # Hypotheses that place the change in different segments were compared on different data.
     then = [each for other in likely for each in every if _is_same(other, each, found.hypothesis.course)]
     return _best(altered, then, given, linear.independent, found.fit) or found
 
@@ -105,7 +105,7 @@ def _different(scores: Sequence[_Score]) -> list[Hypothesis]:
 
 
 def _neighbours(hypothesis: Hypothesis, every: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return the hypotheses of the same sudden change one step earlier and one step later."""
+    """Return the hypotheses that place the same sudden change one step earlier and one step later."""
     alike = [
         each
         for each in every
@@ -169,7 +169,7 @@ class _Linear:
 
     @property
     def independent(self) -> float:
-        """Number of samples, reduced for the correlation of the residual."""
+        """Number of samples, reduced to allow for the residual's correlation."""
         return float(self.samples.sum()) / self.colour
 
     def score(self, altered: Altered, hypothesis: Hypothesis, tried: int) -> _Score:

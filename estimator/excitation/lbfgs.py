@@ -19,11 +19,12 @@ HALVINGS = 20
 ENOUGH = 1e-4  # minimum decrease as a fraction of that predicted by the slope
 GRID = 2.0**-24  # multiple to which each step is rounded
 Pairs = deque[tuple[Array, Array, float]]
-_sum: Callable[[Array], Any] = np.add.reduce  # np.sum takes three times as long for so few numbers
+_sum: Callable[[Array], Any] = np.add.reduce  # np.sum takes three times as long for this few numbers
 
 
 def descend(function: Function, x: Array, steps: int) -> Array:
-    """Minimise `function`, which returns value and gradient, in at most `steps` steps from `x`; return the last `x`.
+    """Minimise `function`, which returns its value and gradient, in at most `steps` steps from `x`; return the last
+    `x`.
 
     Steps are rounded to a grid. Otherwise the last bit of a cosine, which depends on the processor, might lead to
     another minimum.
@@ -55,7 +56,7 @@ def _on_grid(x: Array) -> Array:
 
 
 def _direction(gradient: Array, pairs: Pairs) -> Array:
-    """Return minus the gradient times the approximate inverse Hessian from the remembered steps."""
+    """Return minus the product of the gradient and the inverse Hessian approximated from the stored steps."""
     left, product = gradient.copy(), np.empty_like(gradient)
     shares = []
     for moved, turned, inverse in reversed(pairs):

@@ -182,9 +182,11 @@ def _wave(order: Harmonics, phase: Array, samples: int) -> Array:
     return np.fft.irfft(spectrum, samples)
 
 
-@lru_cache(maxsize=512)  # a search for the largest torque scales the same wave again and again
+@lru_cache(maxsize=512)  # the search for the largest torque rescales the same wave many times
 def _low_crest_phases(harmonics: tuple[int, ...], seed: int, joint: int) -> Array:
-    """Return the best phases [rad] of several optimisations, from randomised Schroeder phases and from random ones."""
+    """Return the best phases [rad] of several optimisations, starting from perturbed Schroeder phases and from random
+    ones.
+    """
     order, random = np.asarray(harmonics, dtype=np.int64), np.random.default_rng((seed, joint))
     count = order.size
     schroeder = -np.pi * np.arange(count) * np.arange(1, count + 1) / count

@@ -105,7 +105,7 @@ class DesignProblem:
         return np.maximum(np.abs([known[name] for name in against]), 1e-9)
 
     def shares(self, wave: Multisine) -> Array:
-        """Return each joint's use of its limits as a fraction (joints,), in the transient and the settled period."""
+        """Return the fraction of its limits that each joint uses (joints,), in the transient and the settled period."""
         response = self._two_periods(wave)
         limits, pose = self.limits, self.pose
         up = (response.position.max(axis=1) - pose) / (limits.high - pose)

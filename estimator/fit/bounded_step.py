@@ -1,8 +1,8 @@
 """Primal active-set method for the step that minimises a convex quadratic function within bounds.
 
-The alternative, clipping the unconstrained step and solving again for the coordinates that remain free, would hold some
-coordinates at bounds that are inactive at the constrained minimum. In a narrow valley such a step can even lead uphill
-(Nocedal and Wright, Numerical Optimization, section 16.5).
+Clipping the unconstrained step and solving again for the free coordinates would instead hold some coordinates at bounds
+that are inactive at the constrained minimum. In a narrow valley such a step can even lead uphill (Nocedal and Wright,
+Numerical Optimization, section 16.5).
 """
 
 import numpy as np

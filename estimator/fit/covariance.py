@@ -24,8 +24,8 @@ from hil.estimator.options import CovarianceOptions
 DEFAULTS = CovarianceOptions()
 FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates stay finite
 SENSITIVE = 1e7  # largest change in a sample, in units of the noise, per unit of a coordinate (RMS)
-LEAST_INFORMATION = 1e-13  # about a combination of coordinates, relative to each alone; less is rounding error
-VANISHED = 1e-3  # slope relative to its value below which a parameter has run into its floor
+LEAST_INFORMATION = 1e-13  # for a combination of coordinates, relative to each alone; anything less is rounding error
+VANISHED = 1e-3  # ratio of slope to value below which a parameter has run into its floor
 
 
 class Scatter:

@@ -34,7 +34,7 @@ class Minimum:
     at: Quadratic
     """The sum of squares at the minimum."""
     iterations: int
-    """Number of points at which the sum was evaluated."""
+    """Number of points at which the sum of squares was evaluated."""
     stalled: bool = False
     """Whether the minimum was accepted because no damping achieved the decrease that the normal equations predict."""
 
@@ -147,8 +147,8 @@ class _Trials:
                 there = self._evaluated(moved)
                 if there.cost < self.at.cost:
                     return (moved, there), max(options.min_damping, taken * trusted)
-            # Also if `cost` indicated a decrease that the normal equations' simulation does not confirm.
-            # Damping rises from that of the first step, not of a less damped one, or the search would never end.
+            # Also if `cost` indicated a decrease that the normal equations' simulation does not confirm. Damping rises
+            # from that of the first step, not from that of a less damped one, or the search would never end.
             damping = max(10.0 * damping, options.initial_damping)
         return None, damping
 
@@ -184,8 +184,8 @@ class _Trials:
 def _step(normal: Array, gradient: Array, damping: float, least: Array, most: Array) -> Array:
     """Return the damped step, with every coordinate's change between `least` and `most`.
 
-    Only the coordinates that reach their limits are held there. If the whole step were scaled instead, an almost flat
-    coordinate, such as the logarithm of a value near zero, would stop all others.
+    Only the coordinates that reach their limits are held there. If the whole step were scaled instead, a coordinate
+    with almost no effect, such as the logarithm of a value near zero, would hold back all others.
     """
     scale = np.sqrt(np.diag(normal))
     scale = np.maximum(scale, 1e-12 * scale.max())

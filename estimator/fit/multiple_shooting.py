@@ -223,7 +223,7 @@ class Shooting:
         self._trust = other._trust
 
     def expected(self, coordinates: Coordinates, shared: Array, own: Array) -> Expected:
-        """Return the prior on small terms, weighted with the mean square residual at these coordinates."""
+        """Return the prior on small terms, weighted by the mean square residual at these coordinates."""
         count = len(coordinates.names)
         inertia = float(coordinates.scales[coordinates.names.index("inertia_1")])
         prior = CoordinatePrior.of(coordinates.names, coordinates.scales, Sizes(*self._scales, inertia))

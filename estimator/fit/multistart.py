@@ -58,7 +58,8 @@ class Search:
     """The objective with coarse integration steps."""
     options: LikelihoodOptions
     coarse: bool
-    """Whether to stop before full convergence if the residual is well above the noise; this suffices to compare models.
+    """Whether to end fits before full convergence if the residual is well above the noise; this suffices to compare
+    models.
     """
 
     @property
@@ -87,7 +88,7 @@ class Search:
         return self._undisguised(refined, replace(minimum, iterations=spent))
 
     def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
-        """Replace constant Stribeck rises by Coulomb friction, unless the fit becomes significantly worse."""
+        """Replace constant Stribeck rises with Coulomb friction, unless the fit becomes significantly worse."""
         if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
             return refined, minimum
         try:
@@ -156,8 +157,8 @@ class Search:
         """Using fine steps, refine the best of `starts` and variants of it with different friction near standstill.
 
         A fit that explains the motion may still have the wrong friction near standstill. The tracking fit determines
-        this friction well, but no fit gets from a narrow Coulomb step to a wide one. Therefore both the friction of the
-        tracking fit and that of `wide` (coordinates) are tried.
+        this friction well, but a fit that starts from a narrow Coulomb step never reaches a wide one. Therefore both
+        the friction of the tracking fit and that of `wide` (coordinates) are tried.
         """
         options = self.options
         ftol = options.ftol_coarse if self.coarse else options.ftol_start

@@ -1,4 +1,4 @@
-"""Weights of position samples from each joint's noise level in a fit; outliers are downweighted (Huber)."""
+"""Weights of position samples, based on each joint's noise level in a fit; outliers are downweighted (Huber)."""
 
 from collections.abc import Sequence
 

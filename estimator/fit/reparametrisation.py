@@ -20,9 +20,9 @@ TYPICAL_SATURATION = 0.02  # typical fraction of the RMS torque lost; only a sca
 LEAST_WEIGHT = 0.02  # minimum gravity_2 to be used as a scale, as a fraction of the RMS torque
 TYPICAL_CABLE = 0.15  # stiffness of a stiff cable, as a fraction of the RMS torque per radian
 TYPICAL_COGGING = 0.01  # typical cogging, as a fraction of the RMS torque; only a scale
-LEAST_RISE = 0.05  # Stribeck rise below which nothing is disguised
-TYPICAL_SQUARE = 1.0 / 3.0  # mean square of a joint's speed, relative to that of its highest; only a guess
-MOST_DECREASE = 0.8  # of a base parameter in one step, relative to itself
+LEAST_RISE = 0.05  # Stribeck rise above which it may stand for Coulomb friction
+TYPICAL_SQUARE = 1.0 / 3.0  # mean squared speed of a joint, relative to its highest speed squared; only a guess
+MOST_DECREASE = 0.8  # maximum relative decrease in a base parameter in one step
 TYPICAL_BEND = 0.01  # rad: typical presliding deflection; only a scale
 
 
@@ -106,7 +106,7 @@ class Coordinates:
             most[index] = min(most[index], room if self._floors[index] else np.log1p(room))
 
     def undisguised(self, x: Array) -> Array:
-        """Return `x` with constant Stribeck rises turned into Coulomb friction; `x` may have further coordinates.
+        """Return `x` with constant Stribeck rises converted to Coulomb friction; `x` may have further coordinates.
 
         If the Stribeck velocity exceeds all speeds of the motion, only the sum of rise and Coulomb friction is
         determined, and a fit that has drifted so far rarely returns to lower Stribeck velocities.

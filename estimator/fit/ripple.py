@@ -20,8 +20,8 @@ from hil.estimator.options import LinearOptions
 
 Wave = Literal["ripple", "cogging"]
 WAVES: tuple[Wave, ...] = get_args(Wave)
-"""Options that add waves over the joint angle: a torque proportional to the motor's (ripple) or independent of it
-(cogging).
+"""Options that add a torque that is periodic over the joint angle: proportional to the motor torque (ripple) or
+independent of it (cogging).
 """
 CYCLES = np.arange(3.0, 40.01, 0.25)  # per turn of the joint; slower variations come from gravity, cables, encoders
 COULOMB_WIDTH = LinearOptions().coulomb_width
@@ -48,7 +48,7 @@ def find_waves(periods: Sequence[SettledPeriod], linear: LinearEstimate, wave: W
             share = np.asarray(linalg.lstsq(extra, goal, rcond=None)[0], dtype=np.float64)
             explained = float(goal @ goal - np.sum((goal - extra @ share) ** 2))
             best = max(best, (explained, cycles, share), key=lambda trial: trial[0])
-        # Torque appears as measured = applied (1 + ripple) + cogging, so the columns explain their negative.
+        # Motor torque = commanded torque (1 + ripple) + cogging, so the fitted coefficients have the opposite sign.
         found |= {f"{wave}_cycles_{joint + 1}": best[1]}
         found |= {f"{wave}_sin_{joint + 1}": -float(best[2][0]), f"{wave}_cos_{joint + 1}": -float(best[2][1])}
     return found
@@ -61,8 +61,8 @@ def _parts(each: list[tuple[Array, Array, Array, Array]]) -> list[tuple[Array, i
 def _prepared(
     period: SettledPeriod, motion: PeriodicMotion, harmonics: int, joint: int, delay: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the Fourier coefficients of a joint's columns and torque as real numbers; also its torque and angle over
-    time.
+    """Return the Fourier coefficients of a joint's columns and torque as real numbers, and the joint's torque and angle
+    over time.
     """
     Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)[joint]
     velocity = motion.velocity[joint]

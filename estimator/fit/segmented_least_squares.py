@@ -85,7 +85,7 @@ class Segmented:
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.
-        own: number of coordinates at the end that each belong to one recording.
+        own: number of trailing coordinates, each of which belongs to one recording.
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
@@ -212,7 +212,7 @@ def minimise_segmented(
                 blocks = _blocks(derivative, shared, own, threads)
                 information, scores, _, _ = blocks.reduced(0.0)
                 information = information + np.diag(prior.precision)
-                freedom = sum(map(np.count_nonzero, rows)) - shared.size - own.size  # residuals of 0 are missing
+                freedom = sum(map(np.count_nonzero, rows)) - shared.size - own.size  # zeros mark missing samples
                 variance = _cost(rows) / max(freedom, 1)
                 return Segmented(shared, own, cost, information, scores, iteration, variance, prior)
     raise ConvergenceError(
@@ -222,7 +222,7 @@ def minimise_segmented(
 
 
 def _cost(rows: Sequence[Array]) -> float:
-    with np.errstate(over="ignore"):  # a motion that diverges costs infinitely much
+    with np.errstate(over="ignore"):  # the cost of a diverging motion is infinite
         return float(sum(np.sum(np.square(row)) for row in rows))
 
 

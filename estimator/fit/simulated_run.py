@@ -39,8 +39,7 @@ class SimulatedRun:
     max_substeps: int
     """Maximum number of substeps into which a step is divided near standstill."""
     pulled_to: Array | None = None
-    """Targets of the springs that pull the arm, as encoder readings that are held constant between samples (joints,
-    samples) [rad].
+    """Encoder readings to which the springs pull the arm, held constant between samples (joints, samples) [rad].
 
     The default is `measured`, without correction for encoder errors.
     """

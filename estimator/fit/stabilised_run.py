@@ -7,7 +7,7 @@ simulation therefore uses the commanded torque and this spring instead of the lo
 then stays close to the real one. The damper, which only determines how fast deviations decay, is left out.
 
 The springs pull the simulated joints to where the real ones were. Therefore the measured angles are first corrected for
-any encoder errors in the model.
+any encoder errors that the model includes.
 """
 
 from collections.abc import Iterator

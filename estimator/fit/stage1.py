@@ -1,8 +1,8 @@
 """Stage 1: linear least squares on Fourier coefficients of settled periods, without initial guesses or local minima.
 
 The motion's lines above the noise are differentiated exactly, the regressor is evaluated on the resulting motion, and
-regressor and torque are compared line by line. The command's derivative is one more column, whose coefficient is the
-delay of the motors: tau(t - delay) = tau(t) - delay tau'(t).
+regressor and torque are compared line by line. The command's derivative is an additional column, whose coefficient is
+the delay of the motors: tau(t - delay) = tau(t) - delay tau'(t).
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class LinearEstimate:
     delay: float
     """Delay of the motors' torque [s]."""
     motions: tuple[PeriodicMotion, ...]
-    """Motion of each period from its lines up to `harmonics`."""
+    """Motion of each period, reconstructed from its lines up to `harmonics`."""
     harmonics: tuple[int, ...]
     """Highest harmonic of each period that the regression uses."""
 
@@ -65,7 +65,7 @@ def fit_lines(*periods: SettledPeriod, options: LinearOptions = DEFAULTS) -> Lin
     torque = np.concatenate([goal for _, goal in equations], axis=1)
 
     theta, _ = _solve(A, torque, np.ones(joints), options.max_condition)
-    # The second time, each joint is weighted by the residual of the first.
+    # In the second pass, each joint is weighted by its residual in the first.
     left = np.sqrt(np.mean(np.abs(torque - A @ theta) ** 2, axis=1))
     weight = 1.0 / np.maximum(left, 1e-12 * np.abs(torque).max())
     theta, std = _solve(A, torque, weight, options.max_condition)

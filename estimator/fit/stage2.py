@@ -37,7 +37,7 @@ from hil.estimator.simulation.back_emf import limited
 
 DEFAULTS = LikelihoodOptions()
 HARDLY = 0.05
-"""Fraction of its usual initial guess at which a new term starts when it is added to a model near its minimum."""
+"""Initial value of a term added to a model near its minimum, as a fraction of the term's usual initial guess."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Fit:
     value: Array
     """Values in the order of `Model.names` [SI]."""
     covariance: Array
-    """Covariance of `value`, also valid for correlated errors; infinite for parameters without influence."""
+    """Covariance of `value`, also valid for correlated errors; infinite for parameters without effect on the motion."""
     starts: tuple[Array, ...]
     """State at the first sample of each run (2, joints) [rad, rad/s]."""
     positions: tuple[Array, ...]
@@ -64,7 +64,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Near:
-    """A point close to a minimum: the result of a similar model for the same periods."""
+    """A point close to a minimum: the result of fitting a similar model to the same periods."""
 
     parameters: Mapping[str, float]
     """Parameters by name [SI]; others start from their usual initial guess."""
@@ -88,7 +88,7 @@ def fit_runs(
         periods: settled periods of one arm.
         model: the model to fit.
         linear: stage 1's estimate for the same periods.
-        coarse: whether to stop early if the residual is well above the noise; this suffices to compare models.
+        coarse: whether to end the fit early if the residual is well above the noise; this suffices to compare models.
         starts: additional initial guesses, parameters by name [SI], tried before all others.
         near: point known to be close to a minimum, used as the only initial guess.
         options: tolerances and limits.
@@ -316,11 +316,11 @@ def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Arr
 
 
 def _doubting(objective: Objective, minimum: Minimum, errors: _Errors) -> Objective:
-    """Return the objective with a wider prior on the length of link 1 if the motion contradicts it; otherwise itself.
+    """Return the objective, with a wider prior on the length of link 1 if the motion contradicts that prior.
 
-    A length that is far from the true one would otherwise be all that determines the coupling in a small motion, which
-    contradicts it by little more than its own standard error. The prior's variance then becomes the one that makes the
-    contradiction typical.
+    In a small motion, a wrong length would otherwise practically determine the coupling by itself, since the motion
+    contradicts it by little more than the standard error of the motion's own estimate. The prior's variance is
+    increased until a contradiction of this size is typical.
     """
     lever = objective.lever
     if lever is None or lever.is_doubted:

@@ -15,16 +15,16 @@ from hil.estimator.arrays import Array, Mask
 from hil.estimator.models.terms import kind_of, term_of
 
 SURE = 3.0  # standard errors by which the best value must lie outside the range
-NEAR = 0.1  # distance from the bound, relative to the step beyond it, within which a fit has ended there
+NEAR = 0.1  # distance from the bound, relative to the step beyond it, within which a fit counts as at the bound
 FAINTEST = 1e-140  # influence of a coordinate below which its square underflows
-MOVED = 1.0  # standard errors by which the bound must shift another parameter for it to count as dependent
+MOVED = 1.0  # standard errors by which the bound must shift another parameter for that parameter to count as affected
 
 
 def scaled_inverse(normal: Array) -> tuple[Array, Array]:
     """Return the pseudo-inverse of a normal matrix (coordinates, coordinates) in which each coordinate is divided by
     its own scale, and these scales (coordinates,).
 
-    The scale of a parameter that has run to zero is many orders of magnitude smaller than that of the others.
+    The scale of a parameter that has fallen to zero is many orders of magnitude smaller than those of the others.
     """
     scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
     scale = np.where(scale > FAINTEST, scale, 1.0)

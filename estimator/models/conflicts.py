@@ -1,4 +1,4 @@
-"""Detection of identified values that are many standard deviations from configured or typical ones.
+"""Detection of identified values that are many standard deviations away from configured or typical ones.
 
 If the model lacks an effect, such as gear backlash, other parameters imitate it. A large deviation from a value known
 beforehand reveals this; standard errors do not.
@@ -15,8 +15,8 @@ from hil.estimator.models.terms import kind_of, term_of
 
 FAR = 4.0  # standard deviations
 LARGE_RATIO, LARGE_ANGLE = 0.35, 0.3
-"""Relative and absolute deviations [1, rad] from a configured value that magnet temperature, tolerances or a horn
-fitted one tooth off cannot explain.
+"""Relative and absolute deviations [1, rad] from a configured value that are too large to be due to magnet temperature,
+tolerances or a horn fitted one tooth off.
 """
 LARGE_SPREAD = 0.3  # standard deviation of a logarithm that is printed as a factor
 Trust = Literal["yes", "with care", "no"]
@@ -54,7 +54,7 @@ class Conflict:
     """Standard deviation of `expected`; if `relative`, of its logarithm."""
     relative: bool
     deviations: float
-    """Distance in combined standard deviations of `value` and `expected`."""
+    """Distance between `value` and `expected`, in combined standard deviations."""
     source: Source
 
     @property

@@ -1,11 +1,10 @@
-"""Comparison of the mean torque over the last few tenths of a second with the model as it was before that time.
+"""Comparison of the mean torque over the last few tenths of a second with the model stored before that time.
 
-If someone pushes or grips the arm while the model is still being learnt, the model adapts to this, and no residual
-stands out. A model stored before the disturbance is unaffected. Therefore the models stored 5, 10 and 20 lessons
-(updates of the model) ago, that is, 0.1, 0.2 and 0.4 s ago, are used: the prediction of each of these models is
-compared with the mean torque since it was stored. Averaging cancels effects that alternate with the motion (noise,
-play, ripple), but not a push. If the joint has hardly moved in that time, the static friction that may have held it is
-subtracted.
+If someone pushes or grips the arm while the model is still being learnt, the model adapts to the disturbance, and the
+residual remains small. A model stored before the disturbance is unaffected. Therefore the models stored 5, 10 and 20
+updates ago, that is, 0.1, 0.2 and 0.4 s ago, are used: the prediction of each of these models is compared with the mean
+torque since it was stored. Averaging cancels effects that change sign during the motion (noise, backlash, ripple), but
+not a push. If the joint has hardly moved in that time, the static friction that may have held it is subtracted.
 
 The terms of a joint's equation, `torque - row theta`, are summed over time, so that the mean between any two stored
 moments requires one subtraction. These functions are part of compiled loops.
@@ -20,7 +19,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.compiled import inner
 
 BACK = (5, 10, 20)
-"""Numbers of lessons (updates of the model) over which the mean is taken."""
+"""Numbers of model updates over which the mean is taken."""
 
 TIMES = 3.5
 """Number of standard deviations beyond which a mean residual torque counts as unexplained by the earlier model."""
@@ -31,7 +30,7 @@ not exact in the next: in a fast swing, terms several times as large as the comm
 """
 
 IN_A_ROW = 2
-"""An unexplained mean residual torque is reported after this number of successive lessons (model updates)."""
+"""An unexplained mean residual torque is reported after this number of successive model updates."""
 
 ELASTIC_RAD = 0.03
 """Distance after a reversal over which dry friction approaches its sliding value [rad]. The deviation from that value
@@ -42,7 +41,7 @@ _SLOTS = max(BACK)
 # A moment: sums over time (seconds; per joint torque, indicator of standstill, speed, row), then per joint the variance
 # of the noise and the static friction, then the parameters and their covariance. The last row but one of the memory
 # holds the present moment; the last one, the number of those stored, the next row to write, and per joint the
-# successive lessons that were not explained and, once they are enough, the mean residual.
+# successive model updates with an unexplained mean residual and, once there are enough, that residual.
 _SECONDS = 0
 _TORQUE, _STANDS, _WAY, _ROW = range(4)
 _STORED, _NEXT, _LASTS, _FOUND = 0, 1, 2, 4
@@ -96,10 +95,11 @@ def store(past: Any, theta: Any, covariance: Any) -> None:
 
 
 def compare(past: Any, j: int, back: int, count: int, floor: float, rounding: float, filter_s: float) -> float:
-    """Return joint `j`'s mean residual torque over the last `back` lessons [N m]; 0 if the earlier model explains it.
+    """Return joint `j`'s mean residual torque since the model was stored `back` updates ago [N m]; 0 if that model
+    explains it.
 
-    Lessons are updates of the model. count: number of parameters. floor: smallest mean that counts [N m]. rounding:
-    variance of one sample's residual due to rounded velocities. filter_s: time constant of the equation's filter [s].
+    count: number of parameters. floor: smallest mean that counts [N m]. rounding: variance of one sample's residual due
+    to rounded velocities. filter_s: time constant of the equation's filter [s].
     """
     now, head = past[_SLOTS], past[_SLOTS + 1]
     if head[_STORED] < back:
@@ -116,7 +116,7 @@ def compare(past: Any, j: int, back: int, count: int, floor: float, rounding: fl
     beyond = abs(mean) - held * then[model + 2 + j]
     if beyond <= floor:
         return 0.0
-    # Only the filtered momenta at both ends enter the mean of a derivative: rounding inside that time cancels.
+    # Only the filtered momenta at both ends enter the mean of a derivative: rounding errors in between cancel.
     variance = then[model + j] + 2.0 * rounding * (filter_s / seconds) ** 2
     for i in range(count):
         own = (now[at + _ROW + i] - then[at + _ROW + i]) / seconds
@@ -140,6 +140,6 @@ def unexplained(past: Any, j: int) -> float:
     return float(past[_SLOTS + 1, _FOUND + j])
 
 
-_inner = partial(inner, _nrt=False)  # nothing in them allocates
+_inner = partial(inner, _nrt=False)  # none of them allocates memory
 forget, add, describe, store, compare = map(_inner, (forget, add, describe, store, compare))
 keep, unexplained = map(_inner, (keep, unexplained))

@@ -21,7 +21,7 @@ LEVER_STD = 0.05
 motion. That component depends on the configured tilt.
 """
 LEVER_DOUBTED = 1.2
-"""Deviation of the motion's own estimate from this prior, in standard deviations of their difference, from which the
+"""Deviation of the motion's own estimate from this prior, in standard deviations of their difference, above which the
 prior is widened.
 """
 
@@ -37,7 +37,7 @@ class Model:
     `delay_lag` both.
 
     Options:
-        presliding: replaces coulomb_width by bristles that deflect before they slip
+        presliding: replaces coulomb_width with bristles that deflect before they slip
             (`hil.estimator.simulation.bristles`).
         asymmetry: adds viscous_asymmetry |v|, friction that depends on direction (the offset covers a
             direction-dependent Coulomb level).
@@ -111,7 +111,7 @@ class Model:
 
     @property
     def description(self) -> str:
-        """Text naming the friction, options and drive."""
+        """Short description of the model: its friction, options and drive."""
         return " + ".join(
             (self.friction, *(each.replace("_", " ") for each in OPTIONS if each in self.options), self.drive)
         )

@@ -11,17 +11,18 @@ the adaptive control of robot manipulators", 1987). The parameters are given as 
 of arms, and are updated with each sample (recursive least squares, that is, a Kalman filter on constants that drift
 slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as the arm moves.
 
-A joint's residual torque is the part that the motion does not account for. An alarm is raised if it exceeds three
-thresholds for `HOLD_S` (a shorter time if it far exceeds them): `TIMES` standard deviations of the uncertainty due to
-parameters and noise, the torque that friction can balance while the joint stands still, and a fraction of the largest
-planned torque. The noise is estimated as well, so that effects that the model lacks (Stribeck friction, backlash,
-flexibility) widen the admissible range. A deviation that could lead to an alarm is only included in this estimate once
-it has subsided without causing an alarm. Otherwise, if something held a joint for a long time, the range would widen
-until nothing exceeded it. A lower noise is assumed while a joint stands still, since most noise arises only in motion.
+A joint's residual torque is the part of its torque that the motion does not account for. An alarm is raised if it
+exceeds three thresholds for `HOLD_S` (or for less if it far exceeds them): `TIMES` standard deviations of the
+uncertainty due to parameters and noise, the torque that friction can balance while the joint stands still, and a
+fraction of the largest planned torque. The noise is estimated as well, so that effects that the model lacks (Stribeck
+friction, backlash, flexibility) widen the admissible range. A deviation that could lead to an alarm is only included in
+this estimate once it has subsided without causing an alarm. Otherwise, if something held a joint for a long time, the
+range would widen until nothing exceeded it. A lower noise is assumed while a joint stands still, since most noise
+arises only in motion.
 
 Once a joint's angle has stayed within its gear's play for `_STAYS_S`, the reported velocity does not show in which
-direction friction acts: the motor may stick while the link floats from one side of the play to the other. A torque that
-friction in either direction could balance then does not contribute to an alarm.
+direction friction acts: the motor may stick while the link floats from one side of the play to the other. In that case,
+a torque that friction in either direction could balance does not contribute to an alarm.
 
 The torque that friction can balance includes the viscous friction at the speeds of the usual motion: in a small motion,
 where presliding of the gear softens every reversal, dry friction looks viscous but still holds the joint once it has
@@ -62,33 +63,33 @@ FLOOR_SHARE = 0.25
 
 _COUNT = len(NAMES)
 _STANDING = 0.05  # rad/s below which dry friction may hold a joint
-_PLAY_RAD = 0.006  # play of a gear (a data sheet says 0.0044) and encoder noise
+_PLAY_RAD = 0.006  # backlash of a gear (0.0044 in a data sheet) plus encoder noise
 _STAYS_S = 0.03  # time within this play after which the direction of friction counts as unknown
 _STATIC = 1.5  # ratio of static to Coulomb friction
-_CERTAIN = 2.0  # standard deviations within which a torque that friction has held is known
+_CERTAIN = 2.0  # standard deviations to subtract from an estimated torque so that the rest certainly acts
 _INERTIAS = 4  # number of inertial parameters, the first ones
-_SHOWN = 2.5  # acceleration from which inertias are learnt, in standard deviations of its rounding
-_VISIBLE = 2.0  # velocity that shows in the register, in standard deviations of its rounding
-_VELOCITY_STD = 0.0135  # rad/s: rounding of the register, with steps of 0.024, and some noise
+_SHOWN = 2.5  # acceleration above which inertias are learnt, in standard deviations of its rounding error
+_VISIBLE = 2.0  # velocity that shows in the register, in standard deviations of its rounding error
+_VELOCITY_STD = 0.0135  # rad/s: rounding of the register, whose resolution is 0.024, and some noise
 _FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned torque
 _NOISE_S = 1.0  # time constant of the noise estimate
 _USUAL_S = 1.0  # time constant of the mean square velocity and of the memory of accelerations
 _CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in variances of the noise
 _STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
-_LESSONS = 2.0  # number of successive updates that share an error of the model
+_LESSONS = 2.0  # number of successive updates that share one model error
 _STANDING_LESSONS = 28.0  # the same, for the rounding of velocities that stay below a tick while a joint hardly moves
 _DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # drift of a parameter per second, relative to its value and to its initial deviation
 _MOST_WEIGHT = 6.0  # maximum weight of a sample whose residual torque far exceeds the threshold
-_OBVIOUS = 3.0  # multiple of the threshold at which one sample is enough at slow rates
+_OBVIOUS = 3.0  # multiple of the threshold at which one sample is enough at low rates
 _WARM_S = 3 * FILTER_S
 _LONGEST_GAP = 3.0  # number of intervals between two samples after which the observer restarts
 
-# Rows of the observer's memory: filtered momentum and rest, rest at the previous sample (two joints each), the
-# parameters, a row of scalars, and the parameters' covariance.
+# Rows of the observer's memory: filtered momentum and remainder, remainder at the previous sample (two joints each),
+# the parameters, a row of scalars, and the parameters' covariance.
 _MOMENTUM, _REST, _FORMER, _THETA, _SINGLE, _COVARIANCE = 0, 2, 4, 6, 7, 8
 _PENDING = _COVARIANCE + _COUNT
-# Behind them, work space that would otherwise be allocated in every call: both joints' regressors, the row of a joint's
-# equation, and the covariance times that row. Each regressor is zero in the same columns of every sample.
+# They are followed by work space that would otherwise be allocated in every call: both joints' regressors, the row of a
+# joint's equation, and the covariance times that row. Each regressor is zero in the same columns of every sample.
 _OF_MOMENTUM = _PENDING + 1
 _OF_REST, _ROW, _GAIN = _OF_MOMENTUM + 2, _OF_MOMENTUM + 4, _OF_MOMENTUM + 5
 # Scalars: per joint filtered torque, noise variance, fraction of time at standstill, duration and sample count of a
@@ -243,7 +244,7 @@ def _gain(m: Any, i: int, row: Any) -> float:
 
 
 def _learn(m: Any, row: Any, gain: Any, lacking: float, spread: float, first: int) -> None:
-    """Update the parameters from index `first` on, with the others' uncertainty considered (Schmidt-Kalman filter)."""
+    """Update the parameters from index `first` on, allowing for uncertainty in the others (Schmidt-Kalman filter)."""
     for i in range(_COUNT):
         gain[i] = _gain(m, i, row)
     for i in range(_COUNT):
@@ -255,7 +256,7 @@ def _learn(m: Any, row: Any, gain: Any, lacking: float, spread: float, first: in
 
 
 def _keep_dissipative(m: Any) -> None:
-    """Replace negative friction by zero, and adjust the other parameters according to the covariance."""
+    """Replace negative friction with zero, and adjust the other parameters according to the covariance."""
     for i in range(6, 10):
         if m[_THETA, i] < 0.0 and m[_COVARIANCE + i, i] > 0.0:
             share = m[_THETA, i] / m[_COVARIANCE + i, i]
@@ -267,7 +268,7 @@ def _static_friction(m: Any, rest: Any, j: int) -> float:
     """Return the largest torque that friction may balance at standstill [N m]."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
     viscous = m[_THETA, 6 + j] - math.sqrt(max(m[_COVARIANCE + 6 + j, 6 + j], 0.0))
-    peak = math.sqrt(2.0 * m[_PENDING, _SQUARED + j])  # velocity of a sine
+    peak = math.sqrt(2.0 * m[_PENDING, _SQUARED + j])  # peak velocity, assuming a sine
     return float(max(_STATIC * (dry + max(viscous, 0.0) * peak), _withstood(rest)))
 
 
@@ -292,7 +293,7 @@ def _is_blocked(
         return False
     friction = _static_friction(m, rest, j)
     variance = 2.0 * noise
-    if abs(distance) > 2.0 * friction:  # otherwise it does not matter, and would take time
+    if abs(distance) > 2.0 * friction:  # otherwise it makes no difference and would only cost time
         variance += _variance(rest, distance, row, m[_COVARIANCE:_PENDING])
     tolerance = max(TIMES * math.sqrt(variance), floor)
     momentum = _VISIBLE * math.sqrt(rounding) * FILTER_S
@@ -331,7 +332,7 @@ def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
         return False
     single[_HELD + j] += dt * min(max(share - 0.5, 1.0), _MOST_WEIGHT)
     single[_SAMPLES + j] += 1.0
-    # Where samples are far apart, a sudden fault may show in a single one.
+    # If samples are far apart, a sudden fault may show in only one of them.
     enough = single[_SAMPLES + j] >= 2.0 or (dt >= HOLD_S and share >= _OBVIOUS)
     return bool(single[_HELD + j] >= HOLD_S and enough)
 
@@ -412,7 +413,7 @@ def _look_back(
     """
     single = m[_SINGLE]
     _add(past, j, single[_TORQUE + j], stands, velocity, row, dt)
-    if single[_LESSON] == 0.0:  # this sample is a lesson
+    if single[_LESSON] == 0.0:  # this sample updates the model
         _describe(past, j, _COUNT, single[_NOISE + j], friction)
         floor, found = _floor(m, k, j), 0.0
         for back in _BACK:
@@ -485,7 +486,7 @@ def _observe_loop(
     return alarm
 
 
-_inner = partial(embedded, _nrt=False)  # nothing in them allocates
+_inner = partial(embedded, _nrt=False)  # none of them allocates memory
 _regressors, _begin_anew, _filter = map(_inner, (_regressors, _begin_anew, _filter))
 _gain, _lacks, _learn = map(_inner, (_gain, _lacks, _learn))
 _keep_dissipative = _inner(_keep_dissipative)

@@ -100,7 +100,8 @@ class Physics:
         for joint in (1, 2):
             stiffness = constant[f"presliding_stiffness_{joint}"]
             if stiffness > 0.0:
-                # Bristles reacting to a reversal oscillate like a spring; an eighth of a radian is resolved well.
+                # Bristles reacting to a reversal oscillate like a spring; an eighth of a radian per substep resolves
+                # this well.
                 times.append(0.125 * math.sqrt(inertia[joint - 1] / stiffness))
             else:
                 turned = 2.0 * constant[f"coulomb_{joint}"] * (1.0 + constant[f"stribeck_rise_{joint}"])

@@ -1,4 +1,4 @@
-"""The arm as a regressor: torque is linear in the base parameters, tau = Y(q, q', q'') theta.
+"""The arm's dynamics in regressor form: torque is linear in the base parameters, tau = Y(q, q', q'') theta.
 
 The arm has two revolute joints in one plane; joint 1 is measured from the horizontal, joint 2 from link 1. With s the
 sign of velocity:

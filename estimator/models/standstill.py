@@ -8,8 +8,8 @@ modelled.
 
 A torque outside the band accelerates a free joint. The joint counts as blocked once the motion of a free joint would
 show in the velocity register. Twice the momentum of that motion is required, because as long as the position of the
-band is unknown, only half of the excess is certain to act on the joint. If a joint moves again, it had been held by
-friction; a torque range that it has withstood in this way never raises an alarm again.
+band is unknown, only half of the excess is certain to act on the joint. If a joint moves again, friction had been
+holding it; a torque range that it has withstood in this way never raises an alarm again.
 
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """
@@ -31,7 +31,7 @@ filtered deceleration has decayed.
 """
 
 HOLD_S = 0.03
-"""Shortest time for which the torque must lie outside the band [s], so that a gear can cross its play."""
+"""Shortest time for which the torque must lie outside the band [s], which gives a gear time to cross its backlash."""
 
 _SINGLES = 9
 # Scalars of a joint, before its two equations: angle at which it came to rest, whether an equation is stored, half of
@@ -51,7 +51,7 @@ def withstood(rest: Any) -> float:
 
 
 def is_suspect(rest: Any) -> bool:
-    """Return whether the torque is outside the band that friction can balance, or was so until just now."""
+    """Return whether the torque is, or was until just now, outside the band that friction can balance."""
     return bool(rest[_UP] > 0.0 or rest[_DOWN] > 0.0)
 
 
@@ -61,10 +61,11 @@ def forget(rest: Any) -> None:
 
 
 def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta: Any) -> float:
-    """Process a sample; return the largest difference between its residual torque and any since the joint came to rest.
+    """Process a sample; return the largest difference between its residual torque and those since the joint came to
+    rest.
 
-    The residual torque is `torque - row theta`. The difference [N m] is to the smallest or the largest residual so far,
-    whichever is further away: positive to the smallest, negative to the largest. It is 0 while the joint moves.
+    The residual torque is `torque - row theta`. The difference [N m] is measured from the smallest residual so far
+    (positive) or the largest (negative), whichever is further away. It is 0 while the joint moves.
 
     rest: one joint's row of `memory`. stands: filtered indicator of standstill, 0 to 1. torque, row: equation of the
     joint at this sample [N m]. theta: parameters.
@@ -142,7 +143,7 @@ def blocked(
     return bool(max(rest[_UP], rest[_DOWN]) > 2.0 * momentum and rest[_LASTS] >= HOLD_S)
 
 
-_inner = partial(inner, _nrt=False)  # nothing in them allocates
+_inner = partial(inner, _nrt=False)  # none of them allocates memory
 forget = _forget = _inner(forget)
 keep = _keep = _inner(keep)
 withstood, is_suspect, look, variance, blocked = map(_inner, (withstood, is_suspect, look, variance, blocked))

@@ -104,7 +104,7 @@ class Term:
     either sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of the two terms whose geometric mean bounds this term. If this is a term of each joint, both belong to the
+    """Names of the two terms whose geometric mean bounds this term. If each joint has this term, both belong to the
     same joint.
     """
     scale: Scale | float = 1.0
@@ -328,7 +328,7 @@ _DECLARED = (
     ),
 )
 TERMS: dict[str, Term] = {term.name: term for term in _DECLARED}
-"""All terms by name, in the order of every parameter vector."""
+"""All terms by name, in the order used in all parameter vectors."""
 
 RIGID_BODY: dict[int, tuple[str, ...]] = {
     1: ("inertia_1", "gravity_1"),
@@ -358,7 +358,7 @@ def joint_of(name: str) -> int | None:
 
 
 def base_names(joints: int) -> tuple[str, ...]:
-    """Return the names of the base parameters, in the order that all vectors of them use; raises ModelError."""
+    """Return the names of the base parameters, in the order used in all parameter vectors; raises ModelError."""
     if joints not in RIGID_BODY:
         raise ModelError(f"an arm of {joints} joints: the planar arm model supports one or two")
     friction = (f"{term}_{joint + 1}" for term in BASE_FRICTION for joint in range(joints))

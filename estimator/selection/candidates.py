@@ -170,7 +170,7 @@ def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, fl
 def ranked(
     about: Linearised, fitted: Sequence[str], richer: Mapping[str, Model], known: Mapping[str, float]
 ) -> list[Candidate]:
-    """Return the score tests of the models `richer`, which are keyed by the part that each adds to `fitted`."""
+    """Return the score tests of the models in `richer`, whose keys name the part that each model adds to `fitted`."""
     new = {part: tuple(n for n in more.names if n not in fitted) for part, more in richer.items()}
     base, _ = about.fall(fitted)
     found = []

@@ -76,7 +76,7 @@ def distortion(period: SettledPeriod, estimate: Estimate) -> Distortion:
         return LineGroup(count, _rms(lines, chosen) / step, _rms(left, chosen) / step) if count else None
 
     driven = group(excited)
-    assert driven is not None  # a torque without any line was rejected before
+    assert driven is not None  # a torque with no lines was rejected earlier
     scatter = np.zeros(period.joints) if period.position_std is None else period.position_std
     # At low rates the motion reaches into the upper half of the lines.
     white = np.minimum(noise_power(lines), np.square(period.noise) / period.samples)

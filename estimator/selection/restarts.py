@@ -17,10 +17,10 @@ from hil.estimator.models.terms import term_of
 from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.waves import ranked_cycles, wave_peaks, without_height
 
-ALIKE_STIFFNESS = 3.0  # ratio of two stiffnesses between which no minimum is expected
+ALIKE_STIFFNESS = 3.0  # ratio of two stiffnesses below which no minimum is expected between them
 WIDE = 0.5  # width of the Coulomb step over the Stribeck velocity above which the two cannot be separated
-NARROW = 1e-3  # rad/s: initial width of an undisguised step
-ALIKE_CYCLES = 0.3  # difference of two numbers of cycles per turn between which no minimum is expected
+NARROW = 1e-3  # rad/s: initial width of a step that replaces a Stribeck rise
+ALIKE_CYCLES = 0.3  # difference in cycles per turn below which no other minimum is expected
 
 
 def left_over(period: SettledPeriod, estimate: Estimate) -> float:
@@ -35,7 +35,7 @@ def left_per_joint(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def restarts(period: SettledPeriod, estimate: Estimate, options: SelectionOptions) -> Iterator[Mapping[str, float]]:
-    """Yield changed parameters, by name, from which another minimum may be reached, those of the worst joint first.
+    """Yield modified parameters, by name, from which another minimum may be reached, those of the worst joint first.
 
     Only joints whose residual exceeds `options.presliding_residual` are changed.
     """
@@ -48,7 +48,7 @@ def restarts(period: SettledPeriod, estimate: Estimate, options: SelectionOption
 
 
 def undisguised(estimate: Estimate) -> dict[str, float]:
-    """Return changed parameters, by name, for joints whose Stribeck rise may really be a narrow Coulomb step.
+    """Return modified parameters, by name, for joints whose Stribeck rise may really be a narrow Coulomb step.
 
     A rise that fades within a wide step resembles a narrow step without a rise, but a fit started from one does not
     reach the other.

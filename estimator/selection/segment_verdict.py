@@ -86,7 +86,7 @@ def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate, gr
 
 
 def _velocity(recording: Recording) -> Array:
-    """Return velocities, smoothed by the distance over ten samples (joints, samples) [rad/s]."""
+    """Return velocities from central differences of neighbouring samples (joints, samples) [rad/s]."""
     return np.asarray(np.gradient(recording.filled(), axis=1)) / recording.interval
 
 
@@ -150,8 +150,8 @@ def _is_refused(left: float, held_out: Array | None, evidence: SegmentEvidence) 
 def _largest_error(left: float) -> float:
     """Return the largest usable prediction error, relative to the motion's RMS. left: residual over noise.
 
-    If the residual hardly exceeds the noise, a larger error is acceptable: half of a recording with little motion
-    merely determines the parameters less well than the whole recording.
+    If the residual hardly exceeds the noise, a larger error is acceptable: the fit to half of a recording with little
+    motion is merely less accurate than that to the whole recording.
     """
     return EXPLAINED_PREDICTION if left <= NEARLY_EXPLAINED else USABLE_PREDICTION
 

@@ -105,7 +105,7 @@ def held_out_errors(
             known = early.reshape(-1)
             r, J = rows[known], columns[known, -own.size :]
             if not (np.isfinite(r).all() and np.isfinite(J).all()):
-                break  # the simulated arm diverges: its prediction is as wrong as one can be
+                break  # the simulated arm diverges: its prediction is as wrong as possible
             step = linalg.lstsq(J, r, rcond=None)[0]
             own = own - np.clip(step, -1.0, 1.0)
             if float(np.abs(step).max()) < 1e-4:

@@ -186,7 +186,7 @@ class Selection:
         return best
 
     def _closest(self) -> list[Trial]:
-        """Return the trials that explain the most, with and without presliding, best first.
+        """Return the trials that explain the motion best, one with and one without presliding, best first.
 
         Ripple is most visible in the fit that explains the most, even if some of its terms are not significant, but
         bristles may have absorbed part of the ripple.
@@ -283,7 +283,7 @@ class Selection:
         return self._left(trial) < self._options.presliding_residual**2
 
     def _converged(self, trial: Trial) -> Trial:
-        """Refit to full precision a trial that stopped early because much remained unexplained."""
+        """Refit, to full precision, a trial that ended early because much of the motion remained unexplained."""
         if not trial.coarse or self._is_explained(trial):
             return trial
         return self._try_or_none(trial.model, trial) or trial
@@ -312,7 +312,7 @@ class Selection:
         """Remove insignificant terms if the motion is explained equally well without them."""
         assert best.estimate is not None
         if self._left(best) > self._options.presliding_residual**2:
-            return best  # effects of missing terms would be attributed to present ones
+            return best  # effects of missing terms would be attributed to those present
         if not best.has_standard_errors:
             return self._pruned_by_fits(best)
         for level in self._options.prune_levels:
@@ -336,7 +336,7 @@ class Selection:
         return best
 
     def _pruned_by_fits(self, best: Trial) -> Trial:
-        """Remove terms one by one, testing each by a fit without it: the motion is too sensitive for a test based on
+        """Remove terms one by one, testing each by a fit without it, if the motion is too sensitive for a test based on
         standard errors.
         """
         for part, plainer in removable_parts(best.model):
@@ -373,7 +373,7 @@ class Selection:
         return self._left(trial) < self._options.explained_residual**2
 
     def _gain(self, richer: Trial, plainer: Trial) -> float:
-        """Return twice the gain in log-likelihood, with the number of samples reduced for correlation."""
+        """Return twice the gain in log-likelihood, with the number of samples reduced to allow for correlation."""
         assert richer.estimate is not None
         independent = self._samples / colour(richer.estimate.residual)
         return independent * float(np.log(max(self._left(plainer), 1e-12) / max(self._left(richer), 1e-12)))

@@ -37,10 +37,12 @@ class Trial:
     held_out: Array | None
     """RMS error of the open-loop prediction of the held-out motion, relative to that motion's RMS (joints,)."""
     score: float
-    """RMS error of the held-out motion's prediction in units of the noise; without one, the result of `criterion`."""
+    """RMS error of the held-out motion's prediction in units of the noise; without a held-out motion, the result of
+    `criterion`.
+    """
     seconds: float
     coarse: bool = False
-    """Whether the fit was allowed to stop early if it left much of the motion unexplained."""
+    """Whether the fit was allowed to end early if it left much of the motion unexplained."""
 
     @property
     def has_standard_errors(self) -> bool:
@@ -55,7 +57,7 @@ class Choice:
     trials: tuple[Trial, ...]
     chosen: Trial
     period: SettledPeriod
-    """The first period as it was fitted: corrected for a change in friction, if one was seen."""
+    """The first period as it was fitted: corrected for a change in friction, if one was found."""
     drift: Drift | None = None
     """The change in friction for which the period was corrected; None for no correction."""
 
@@ -107,7 +109,7 @@ class Fitting:
     held_out: SettledPeriod | None
     starts: Sequence[Mapping[str, float]]
     drift: Drift | None = None
-    """Change in friction from the fitted periods to `held_out`; both are corrected for it."""
+    """Change in friction from the fitted periods to `held_out`, for which both are corrected."""
 
     def trial(self, model: Model, near: Trial | None, values: Mapping[str, float], coarse: bool) -> Trial:
         """Fit `model` from scratch or from the result of `near`, in which `values` replace or add parameters.

@@ -180,7 +180,7 @@ class _Search:
         return self._by_prediction(plain)
 
     def _by_prediction(self, plain: ShootingEstimate) -> ShootingEstimate:
-        """Return the estimate whose model predicts best, for motions that no model explains."""
+        """Return the estimate whose model predicts best; used if no model explains the motion."""
         best, near = self.trial(plain, plain.model), plain
         loaded = replace(plain.model, friction=FRICTIONS[-1])
         for richer in (loaded, loaded.having("presliding"), loaded.having(*SMOOTH)):

@@ -240,7 +240,7 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
 
 def _drifted(drift: Drift | None, validation: Validation) -> tuple[str, ...]:
     """Return a sentence on each joint whose friction has changed. If much of the motion is unexplained, an effect that
-    the model lacks may only look like such a change.
+    the model lacks may merely look like such a change.
     """
     if drift is None:
         return ()
@@ -253,7 +253,7 @@ def _drifted(drift: Drift | None, validation: Validation) -> tuple[str, ...]:
         return (
             f"Friction seems to have changed within {drift.seconds:.0f} s "
             f"({', '.join(f'{joint} by {100.0 * change:+.2g} %' for joint, change in changed)}), but as long as the "
-            "motion is not explained, the same missing effect may cause this.",
+            "motion is not explained, an effect that the model lacks may be the cause.",
         )
     return tuple(
         f"Friction of {joint} {'fell' if change < 0.0 else 'rose'} by {percent(abs(change))} within "
@@ -272,7 +272,7 @@ def _pushed(torque: TorqueChange | None) -> tuple[str, ...]:
     )
     return (
         f"Relative to the fitted motion, a constant torque of {found} acts in the held-out one. It explains the "
-        "difference better than a change of friction does. In one of the two motions, something pushed or pulled the "
+        "difference better than a change in friction does. In one of the two motions, something pushed or pulled the "
         "arm, a cable tightened, the arm carried something, or its base tilted. Remove the cause and record again.",
     )
 

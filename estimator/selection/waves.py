@@ -29,10 +29,10 @@ def wave_peaks(
     """Return the numbers of `cycles` per turn at which a wave explains more of the residual than at neighbouring
     numbers, best first.
 
-    Whatever the fitted parameters can explain is first removed from the residual and the waves. The result is keyed by
-    parameter name. If other terms have absorbed part of a wave, the best number may be wrong. Therefore other numbers
-    are returned as well if what they explain of the sum of squares is at least the fraction `COMPARABLE` of what the
-    best number explains.
+    First, the components that the fitted parameters can explain are removed from the residual and the waves. The result
+    is keyed by parameter name. If other terms have absorbed part of a wave, the best number may be wrong. Therefore
+    other numbers are returned as well if they reduce the sum of squares by at least the fraction `COMPARABLE` of the
+    best number's reduction.
 
     only: joints (from 1) to consider; by default all.
     """

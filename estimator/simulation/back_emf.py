@@ -26,14 +26,16 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import CONSTANTS, GENERATED, LEAST_INERTIA, OWN_INERTIA, VISCOUS, Physics
 
 UNKNOWN_DELAY = 5e-4
-"""Standard deviation of d, for a control loop of 1 ms [s]."""
+"""Standard deviation of the delay d of the voltage, for a control loop of 1 ms [s]."""
 
 _LATE: dict[str, tuple[int, ...]] = {"lag": (0, 1), "delay": (0, 1), "lag_difference_2": (1,)}
 """For each parameter, the joints whose torque it delays."""
 
 
 def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the constants by which the simulation must differentiate to obtain the derivatives for `names`."""
+    """Return the constants with respect to which the simulation must differentiate to obtain the derivatives for
+    `names`.
+    """
     through = [
         CONSTANTS[place]
         for joint in _generating(physics)

@@ -201,13 +201,13 @@ def _loop(
     fallen1 = 1.0 - math.exp(-step / lag[0]) if lag[0] > 0.0 else 1.0
     fallen2 = 1.0 - math.exp(-step / lag[1]) if lag[1] > 0.0 else 1.0
     share1, share2 = fallen1 * lag[0] / step, fallen2 * lag[1] / step
-    uneven = np.any(e != 0.0)  # perfect encoders are not worth eight sines a sample
+    uneven = np.any(e != 0.0)  # saves eight sines per sample if the encoders are perfect
     for k in range(command.shape[1]):
         c1 = command[0, k] + gains[0, 0] * (gains[2, 0] - s1) - gains[1, 0] * w1
         c2 = command[1, k] + gains[0, 1] * (gains[2, 1] - s2) - gains[1, 1] * w2
         c1 = min(max(c1, -gains[3, 0]), gains[3, 0])
         c2 = min(max(c2, -gains[3, 1]), gains[3, 1])
-        # The loop is closed on what the encoders read.
+        # The feedback uses the encoder readings.
         s1, s2 = q1, q2
         if uneven:
             s1 += e[0, 0] * math.sin(q1) + e[0, 1] * math.cos(q1)

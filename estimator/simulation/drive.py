@@ -72,7 +72,7 @@ def _torque(
 
 # Compiled code takes its arguments by position. For joint j, edge i of each sample's steps lies `phases[j, i]` [s]
 # after the command that is `shifts[j, i]` commands later; `fading[j, i]` is the fraction of the lag's deviation that
-# remains by then.
+# then remains.
 def _average_loop(
     command: Any,
     total: Any,
@@ -104,7 +104,8 @@ def _average_loop(
                 present = held + left
                 by_lag = left * phases[j, i] / (lag * lag) + lagging[1, at] * fading[j, i] if lag > 0.0 else 0.0
                 if i > 0:
-                    # lag y' = u - y, integrated over a step: the mean of y is that of u minus what the lag stores.
+                    # lag y' = u - y, integrated over a step: the mean of y is that of u minus the change stored by the
+                    # lag.
                     stored = (present - present_before) * per_time
                     torque[j, k, i - 1] = (gathered - gathered_before) * per_time - lag * stored
                     late[j, k, i - 1] = -stored

@@ -77,5 +77,5 @@ def _steepness(physics: Physics, position: Array) -> Array:
 
 
 def _waves(position: Array) -> Array:
-    """Return the sines and cosines by which the errors in ENCODER are multiplied (joints, samples, terms)."""
+    """Return the sines and cosines that the amplitudes in ENCODER multiply (joints, samples, terms)."""
     return np.stack((np.sin(position), np.cos(position), np.sin(2.0 * position), np.cos(2.0 * position)), axis=2)

@@ -246,7 +246,8 @@ def _loop(
                 _accelerate(bristles, Z, 0.0, -1.0 / h, count)
                 faster[0], faster[1] = arm_step(m, x, t1, t2, h, now, room)
                 _press(rows, here, bristles, now, count)
-                # Immediately, since the bristles' second half needs the effect of this step on the velocities.
+                # Done immediately, since the second half of the bristles' step needs the effect of this step on the
+                # velocities.
                 follow(rows, numbers, Z, now, count)
                 _accelerate(bristles, Z, 1.0, 1.0 / h, count)
                 _bend(p, m, b, bristles, x, t1, t2, 0.5 * h, -0.5 * h, dt, Z, count)

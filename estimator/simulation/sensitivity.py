@@ -53,8 +53,8 @@ from hil.estimator.simulation.arm import (
     pieces_now,
 )
 
-# Quantities by which one can differentiate: the constants, the drive's times, encoder errors that move the ends of the
-# springs, the state at the first sample.
+# Quantities with respect to which the motion can be differentiated: the constants, the drive's times, encoder errors
+# that move the ends of the springs, the state at the first sample.
 TRACKED = tuple(f"{name}_{joint}" for name in ENCODER for joint in (1, 2))
 STATES = ("position_1", "position_2", "velocity_1", "velocity_2")
 CAUSES = (*CONSTANTS, "delay", "lag", "lag_difference_2", *TRACKED, *STATES)
@@ -63,14 +63,14 @@ STATE = END + len(TRACKED)
 COUPLING, GRAVITY_1, GRAVITY_2 = map(CONSTANTS.index, ("coupling", "gravity_1", "gravity_2"))
 ZERO_1, ZERO_2 = ZERO, ZERO + 1
 
-AT_ONCE = 8  # causes that a processor may handle at once; their number is padded to a multiple of this
+AT_ONCE = 8  # causes that a processor can handle at once; their number is padded to a multiple of this
 NOWHERE = AT_ONCE * math.ceil(len(CAUSES) / AT_ONCE)  # column for unwanted derivatives
 WIDE = NOWHERE + AT_ONCE
-# Rows of each step by causes: f1, f2, slope_1, slope_2, m11, m12, m22 of stage 1, then of stage 2.
+# Rows of each step, with causes as columns: f1, f2, slope_1, slope_2, m11, m12, m22 of stage 1, then of stage 2.
 STAGE = 7 * WIDE
 SLOPES, MASSES = 2 * WIDE, 4 * WIDE  # from the stage's first row
-# Scalars of each step. For each stage, derivatives by the state: f1 and f2 by q1, q2, v1, v2; slope_1 by q1, v1;
-# slope_2 by q2, v2; m11 and m12 by q2. Then scalars common to all parameters, see `arm_step`.
+# Scalars of each step. For each stage, derivatives with respect to the state: f1 and f2 to q1, q2, v1, v2; slope_1 to
+# q1, v1; slope_2 to q2, v2; m11 and m12 to q2. Then scalars common to all parameters, see `arm_step`.
 BY_STATE = 14
 NUMBERS = 2 * BY_STATE + 24
 
@@ -158,8 +158,8 @@ class Sensitive:
 #   rows, numbers  rows and scalars as above, flattened
 #   here           angles and velocities at which the stage is evaluated (2, joints)
 #   left, slope    torques available for acceleration and slopes of friction (stages, joints)
-#   dt             derivatives of the motor torques by delay and lag (causes, joints)
-#   spring         stiffness and target angle of the springs, and the target's derivatives by encoder errors
+#   dt             derivatives of the motor torques with respect to delay and lag (causes, joints)
+#   spring         stiffness and target angle of the springs; derivatives of the target with respect to encoder errors
 #   at             the column of each cause
 def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> None:  # noqa: PLR0915 a call costs time
     """Write a drive's torque minus friction, the slope of friction, and all derivatives to `room`."""
@@ -211,7 +211,7 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     if at[SATURATION + joint] != NOWHERE:
         lost = -cube * shape
         rows[f + at[SATURATION + joint]], rows[s + at[SATURATION + joint]] = lost * passed, lost * loaded * bent
-    # By the torque before saturation and ripple, which includes the back-EMF.
+    # With respect to the torque before saturation and ripple, which includes the back-EMF.
     driven, driven_slope = eased * shape * passed, eased * shape * loaded * bent
     if at[GENERATED + joint] != NOWHERE:
         rows[f + at[GENERATED + joint]], rows[s + at[GENERATED + joint]] = v - v * driven, -v * driven_slope

@@ -97,7 +97,7 @@ def design_path(
     """Design a path with harmonics up to `highest` [Hz] that keeps each joint within limits.
 
     The joints stay within `swing` (joints,) [rad] of `centre` (joints,) [rad] and below `speed` (joints,) [rad/s].
-    rate: samples per second; period [s]; prior: rough parameters, whose uncertainty determines which information
+    rate: samples per second; period [s]; prior: approximate parameters, whose uncertainty determines which information
     matters. Raises ExcitationError.
     """
     count = int(np.floor(highest * period + 1e-9))
@@ -125,7 +125,9 @@ def design_path(
 
 @dataclass(frozen=True)
 class Goal:
-    """How accurately a path, together with the prior, determines the torque of other motions in its box."""
+    """Design criterion: how accurately a path, together with the prior, determines the torque of other motions in its
+    box.
+    """
 
     base: BaseParameters
     prior: Prior
@@ -156,7 +158,7 @@ class Goal:
         """Return the effect of each unknown on the angles, in units of their noise (joints samples, unknowns).
 
         A torque acts on the angle through the joint's inertia, and the observer pulls the angle towards the
-        measurements. Each of the few samples represents several samples of the recording.
+        measurements. The path is sampled coarsely: each sample represents several samples of the recording.
         """
         spectrum = np.fft.rfft(columns, axis=1) * self._response[:, :, None]
         noise = NOISE * np.sqrt(self._samples / self.readings)

@@ -36,7 +36,7 @@ FIRST_STEP, FASTER, SLOWER = 0.3, 1.1, 0.9
 SHRINKS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
 SWING_SHARE = 0.9  # fraction of the distance from a centre to the nearer limit
 LEAST_SWING_SHARE = 0.15
-_MEAN_SHARE = 0.1  # weight of the mean log error in the criterion; the log of the worst has the rest
+_MEAN_SHARE = 0.1  # weight of the mean log error in the criterion; the log of the largest has the remaining weight
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class Design:
 
     centre: centre of the path (joints,) [rad]. lines: complex Fourier coefficients (joints, harmonics), before scaling
     to the limits.
-    worst, median: largest and median standard error of the base parameters after the path, each relative to its prior's
-    standard deviation.
+    worst, median: largest and median standard error of the base parameters estimated from the path, each relative to
+    its prior's standard deviation.
     """
 
     centre: Array
@@ -70,7 +70,7 @@ class Design:
 
 
 class PathDesigner:
-    """Designs paths of one `period` [s], sampled at `rate`, with harmonics up to `highest` [Hz]. Raises
+    """Designs paths that last one `period` [s], sampled at `rate`, with harmonics up to `highest` [Hz]. Raises
     ExcitationError.
 
     friction: typical Coulomb friction (joints,) [N m].
@@ -147,7 +147,7 @@ class PathDesigner:
         return Path(centre + share * (path.position - centre), share * path.velocity, share * path.acceleration)
 
     def worth(self, path: Path) -> tuple[float, float]:
-        """Return the largest and the median standard error of the base parameters after a path.
+        """Return the largest and the median standard error of the base parameters estimated from a path.
 
         Each is relative to the prior's standard deviation.
         """
@@ -202,7 +202,7 @@ class PathDesigner:
         return float((1.0 - _MEAN_SHARE) * errors.max() + _MEAN_SHARE * errors.mean())
 
     def _errors(self, path: Path, every: int) -> Array:
-        """Return the base parameters' standard errors after one period, relative to the prior's (base parameters,)."""
+        """Return the base parameters' standard errors from one period, relative to the prior's (base parameters,)."""
         some = slice(0, None, every)
         Y = self._base.regressor(path.position[:, some], path.velocity[:, some], path.acceleration[:, some])
         level = np.sqrt(np.mean((Y @ self._prior.value) ** 2, axis=1) + self._friction**2) + 1e-6
@@ -228,7 +228,9 @@ class PathDesigner:
         return Design(centre, lines, path, worst, median)
 
     def _fitted(self, centre: Array, lines: Array, waves: tuple[Array, Array, Array]) -> Path | None:
-        """Return the path scaled to the limits of position and speed and shrunk until allowed; None if it never is."""
+        """Return the path scaled to the limits of position and speed, then shrunk until `allowed` accepts it, or else
+        None.
+        """
         room = np.minimum(centre - self._limits.low, self._limits.high - centre)
         span = self._limits.high - self._limits.low
         swing = np.maximum(SWING_SHARE * room, 0.0)

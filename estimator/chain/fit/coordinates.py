@@ -152,8 +152,8 @@ class ChainCoordinates:
     def _following(self) -> Array:
         """Weights with which parameters follow the logarithms of the torque scales (parameters, joints - 1).
 
-        An offset follows the scale of its own joint. A link's parameters follow the mean scale of the joints from the
-        second to its own; those of the first link follow none.
+        An offset follows the scale of its own joint. A link's parameters follow the mean scale of the joints from joint
+        2 up to its own; those of the first link follow none.
         """
         weights = np.zeros((len(self.names), self.torque_scales.size))
         for index, (name, kind) in enumerate(zip(self.names, self._kinds, strict=True)):

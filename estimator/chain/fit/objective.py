@@ -64,7 +64,7 @@ class ChainProblem:
     softness: float
     """Natural frequency of the observer [Hz]."""
     finer: int = 1
-    """Number of smaller integration steps that replace one step in which a joint may be near standstill."""
+    """Number of smaller steps into which an integration step is divided if a joint may be near standstill during it."""
     every: int = 1
     """Only every `every`-th sample is compared, and integration steps are longer by this factor, which may exceed 1
     only if `steps` is 1.
@@ -72,11 +72,11 @@ class ChainProblem:
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; smaller near the minimum."""
     prior_weight: float = 1.0
-    """Scale of the prior's precision; above 1 while model errors exceed the noise that the weights assume, so that the
-    prior still decides what the data do not determine.
+    """Factor on the prior's precision. It exceeds 1 while model errors exceed the noise that the weights assume, so
+    that the prior still decides what the data do not determine.
     """
     added: tuple[Array | None, ...] = ()
-    """Known base parameters of the mass added in each period (base parameters,) [SI]; None if there was none."""
+    """Base parameters of the known mass added in each period (base parameters,) [SI]; None if none was added."""
     latest: _Latest = field(repr=False, compare=False, default_factory=_Latest)
 
     @property
@@ -94,7 +94,7 @@ class ChainProblem:
         return (x[first : first + size] * self.state_scale).reshape(2, -1)
 
     def run_of(self, period: SettledPeriod, parameters: dict[str, float]) -> ChainRun:
-        """Return the simulation's input for a period, with the delay and lag in `parameters`."""
+        """Return the simulation's input for a period, with the delay and lag taken from `parameters`."""
         torque, slopes = torque_and_slopes(
             *(period.torque, period.rate, period.command_to_sample, self.steps),
             delay=parameters.get("delay", 0.0),
@@ -109,7 +109,7 @@ class ChainProblem:
         )
 
     def _measured(self, period: SettledPeriod) -> Array:
-        """Return the measured angles that are compared (samples, joints) [rad]."""
+        """Return the measured angles that are compared with the simulation (samples, joints) [rad]."""
         return np.ascontiguousarray(period.position.T[:: self.every][: period.samples // self.every])
 
     def _thinned(self, of_steps: Array) -> Array:
@@ -257,14 +257,14 @@ class ChainProblem:
         return self.steps, self.softness, self.finer, self.every
 
     def scatter(self, x: Array, lags: int) -> Array:
-        """Return the matrix S of the scores (coordinates, coordinates); see `hil.estimator.fit.covariance`."""
+        """Return the scatter matrix S of the scores (coordinates, coordinates); see `hil.estimator.fit.covariance`."""
         total = np.zeros((x.size, x.size))
         parameters = self.parameters(x)
         for index, (period, weight) in enumerate(zip(self.periods, self.weights, strict=True)):
             where, slopes = self._where(x, index)
             scatter = Scatter(slopes.size, lags)
             for part, r, J in self._pieces(x, index, period, parameters):
-                assert r is not None  # the minimum's motion is finite
+                assert r is not None  # the motion at the minimum is finite
                 scatter.add(np.einsum("sj,sjc->sc", weight[part] ** 2 * r, J))
             total[np.ix_(where, where)] += scatter.sum() * np.outer(slopes, slopes)
         return total
@@ -278,7 +278,7 @@ class ChainProblem:
         where, slopes = self._where(x, index)
         residuals, jacobians = [], []
         for part, r, J in self._pieces(x, index, period, self.parameters(x)):
-            assert r is not None  # the minimum's motion is finite
+            assert r is not None  # the motion at the minimum is finite
             residuals.append(weight[part] * r)
             jacobians.append(weight[part][:, :, None] * J * slopes)
             if part.stop >= most:

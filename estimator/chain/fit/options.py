@@ -15,7 +15,9 @@ class ChainOptions:
     A softer observer extracts more information; one that is too soft no longer follows the motion.
     """
     lost: float = 1.5
-    """A softer observer is rejected if the cost grows by more than this factor times the growth due to its softness."""
+    """A softer observer is rejected if the cost grows by more than this factor times the growth expected from its
+    softness.
+    """
     first_step: float = 5.2e-3
     """Integration step while the observer is stiff [s]; samples within such a step are skipped."""
     coarse_step: float = 2.6e-3
@@ -23,22 +25,25 @@ class ChainOptions:
     fine_step: float = 1.3e-3
     """Integration step of the last iterations [s]."""
     finer: int = 16
-    """Number of smaller steps that replace one step near standstill, where friction changes fast."""
+    """Number of smaller steps into which a step near standstill is divided, since friction changes fast there."""
     finest: int = 64
-    """Number of smaller steps that replace one step near standstill in the last iterations."""
+    """Number of smaller steps into which a step near standstill is divided in the last iterations."""
     widths_per_substep: float = CoordinateOptions.widths_per_substep
     width_floor: float = 3e-4
     """Minimum width of every Coulomb step [rad/s]; a step this narrow is hardly distinguishable from true sticking."""
     initial_width: float = 0.03
     """Initial width of the smoothed Coulomb step [rad/s]."""
     other_initial_widths: tuple[float, ...] = (0.005, 0.001)
-    """Initial widths of further fits, which are tried until one explains the motion [rad/s]."""
+    """Initial widths for further fits, tried in turn until one explains the motion [rad/s]."""
     far: float = 3.0
-    """Worst joint's RMS residual relative to its noise above which a fit is repeated, first with free encoder zeros."""
+    """RMS residual of the worst joint, relative to its noise, above which a fit is repeated, first with free encoder
+    zeros.
+    """
     poor: float = 1.2
     """RMS weighted residual above which a second initial guess is tried; 1 for noise alone."""
     test_zeros: bool = False
-    """Whether to test the encoder zeros that the model holds fixed; takes one more simulation with sensitivities."""
+    """Whether to test the encoder zeros that the model holds fixed; this takes one more simulation with sensitivities.
+    """
     min_initial_lag: float = 5e-4
     """Minimum initial guess of the lag [s]."""
     reach: float = 0.3

@@ -38,7 +38,7 @@ def fit_filtered(
 def filtered_torques(
     recordings: Sequence[Recording], model: ChainModel, cutoff: float, delay: float
 ) -> tuple[Array, Array]:
-    """Return the rows of `filtered_torque` of all recordings, one after the other."""
+    """Return the rows of `filtered_torque` for all recordings, concatenated."""
     rows = [filtered_torque(recording, model, cutoff, delay) for recording in recordings]
     return np.concatenate([Y for Y, _ in rows], axis=1), np.concatenate([tau for _, tau in rows], axis=1)
 

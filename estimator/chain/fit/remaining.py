@@ -1,4 +1,4 @@
-"""Distance from the point where a fit stopped to the minimum."""
+"""Distance to the minimum from the point where a fit ended."""
 
 import numpy as np
 

@@ -16,7 +16,7 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.fourier import Lines, PeriodicMotion, cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 
-COULOMB_WIDTH = 0.05  # rad/s: about the velocity error of a sticking joint due to the omitted lines
+COULOMB_WIDTH = 0.05  # rad/s: about the velocity error of a sticking joint due to the omitted Fourier lines
 PASSES = 3
 
 
@@ -41,7 +41,7 @@ def fit_lines(
 ) -> ChainLinear:
     """From settled periods, estimate the parameters in which the torque is linear.
 
-    added: known base parameters of the mass added to the arm in each period (base parameters,) [SI]; None if none was
+    added: base parameters of the known mass added to the arm in each period (base parameters,) [SI]; None if none was
     added.
     """
     lines = [lines_of(period.filled()) for period in periods]

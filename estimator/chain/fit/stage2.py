@@ -38,7 +38,7 @@ from hil.estimator.options import CovarianceOptions, MinimiserOptions
 
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 NEARER, LAST = MinimiserOptions(max_damping=0.1), MinimiserOptions(max_damping=1.0)
-"""Options for the last iterations with coarse steps, and for the following ones with fine steps.
+"""Options for the last iterations with coarse steps, and for the subsequent iterations with fine steps.
 
 If a joint is on the verge of sticking, the sum of squares is slightly discontinuous. A decrease achieved only with
 heavy damping is due to such a discontinuity and is not pursued.
@@ -89,7 +89,9 @@ class ChainFit:
 
     @property
     def reached(self) -> bool:
-        """Whether the fit has reached its minimum, so that another step would be shorter than one standard error."""
+        """Whether the fit has reached its minimum, that is, whether one more step would be shorter than one standard
+        error.
+        """
         return self.remaining <= DEFAULTS.unfinished
 
 
@@ -109,8 +111,8 @@ def fit_periods(
     """
     problem, x = first_problem(periods, model, linear, prior, options)
     problem = replace(problem, added=tuple(added))
-    # Undivided steps cannot resolve friction near standstill: its shape, fitted to them, would end up far away in a
-    # curved valley, along which the later fits progress slowly.
+    # Undivided steps cannot resolve friction near standstill: a friction shape fitted with such steps would end up far
+    # away in a curved valley, along which the later fits progress slowly.
     coarse = replace(problem, steps=integration_steps(periods, options.coarse_step), reach=0.0)
     if near is None:
         sticking, rough, spent = started(coarse, x, options)
@@ -120,7 +122,7 @@ def fit_periods(
         spent += near.iterations
     bounded = sticking.coordinates
     positions = sticking.positions(rough.x)
-    assert positions is not None  # the minimum's motion is finite
+    assert positions is not None  # the motion at the minimum is finite
     weights, outliers = noise_weights(periods, positions, options.outlier_threshold)
     weights = tuple((weight * repeated(each)).T for weight, each in zip(weights, periods, strict=True))
     nearer = replace(sticking, weights=weights, reach=options.reach).minimise(
@@ -128,8 +130,8 @@ def fit_periods(
     )
     last = replace(sticking, weights=weights, steps=problem.steps, finer=options.finest, reach=options.reach)
     damped = last.minimise(nearer.x, options.ftol, options=LAST)
-    # Damping holds back poorly determined coordinates, so it is removed now. Had it been absent from the beginning,
-    # many coordinates would reach their step limits and hold up the others.
+    # Damping holds back poorly determined coordinates, so it is removed now. Without damping from the beginning, many
+    # coordinates would have reached their step limits and held up the others.
     minimum = damped
     if not damped.stalled:
         minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
@@ -140,7 +142,7 @@ def fit_periods(
         try:
             minimum, last = finer.minimise(minimum.x, options.ftol, MINIMISER.min_damping, LAST), finer
         except ConvergenceError:
-            pass  # what remains widens the standard errors
+            pass  # the remaining distance widens the standard errors
         else:
             spent += minimum.iterations
     return _fit(last, minimum, outliers, COVARIANCE, spent, options.test_zeros and not model.zeros)
@@ -156,7 +158,7 @@ def _fit(
 ) -> ChainFit:
     x, count = minimum.x, problem.count
     positions = problem.positions(x)
-    assert positions is not None  # the minimum's motion is finite
+    assert positions is not None  # the motion at the minimum is finite
     residuals = [
         weight.T * np.where(period.valid, period.position - position, 0.0)
         for period, position, weight in zip(problem.periods, positions, problem.weights, strict=True)
@@ -213,7 +215,7 @@ def _at_bound(problem: ChainProblem, minimum: Minimum, value: Array, std: Array)
 
 
 def _larger(one: Array, other: Array) -> Array:
-    """Return a covariance at least as large as both; infinite where either is infinite."""
+    """Return a covariance at least as large as both arguments; infinite where either is infinite."""
     length = np.sqrt(np.maximum(np.diag(one), np.diag(other)))
     known = np.flatnonzero(np.isfinite(length) & (length > 0.0))
     at, lengths = np.ix_(known, known), np.outer(length[known], length[known])

@@ -30,7 +30,7 @@ from hil.estimator.simulation.arm import steps_per_sample
 
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0, ADDED_MASS: 1.0}
 START |= {"back_emf": 0.92, "lag_ratio": 1.0}
-REPEATED = 4  # consecutive equal readings that still count in full: a moving joint produces as many
+REPEATED = 4  # consecutive equal readings that count in full: a moving joint can produce this many
 
 
 def first_problem(
@@ -74,8 +74,8 @@ def integration_steps(periods: Sequence[SettledPeriod], longest: float) -> int:
 def repeated(period: SettledPeriod) -> Array:
     """Return the weight of each sample (joints, samples), less than 1 for a sample that shares its neighbours' error.
 
-    While a joint sticks, its encoder repeats one reading with one rounding error. If it counted at every sample, that
-    error would make the simulated joint creep towards the reading. Therefore any number of equal readings in a row
+    While a joint sticks, its encoder repeats one reading with one rounding error. If this error counted at every
+    sample, it would make the simulated joint creep towards the reading. Therefore any number of equal readings in a row
     counts as at most REPEATED readings.
     """
     weight = np.ones_like(period.position)
@@ -125,7 +125,7 @@ def resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple[
     from `soft`, and the number of simulations used.
     """
     narrowest = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
-    # An early fit may be far off: where it makes a joint much too light, the friction step must not stay wide.
+    # An early fit may be far off: if it makes a joint much too light, that joint's friction step must not stay wide.
     floor = np.clip(narrowest, options.width_floor, options.initial_width)
     bounded = replace(coarse.coordinates, width_floor=floor)
     soft = bounded.raised(soft)
@@ -171,7 +171,7 @@ def softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Arr
         every = 1 if last or coarse.steps > 1 else skip
         trial = replace(coarse, softness=frequency, every=every)
         growth = options.lost * (softness / frequency) ** 2
-        # What follows starts with this observer, so no fit is needed here to show that it is good enough.
+        # The subsequent fits start with this observer, so no fit is needed here to show that it is good enough.
         if last and cost is not None and _of_data(trial, x) <= growth * (cost + x.size):
             return x, frequency, spent
         try:

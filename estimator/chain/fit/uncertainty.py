@@ -25,7 +25,7 @@ from hil.estimator.chain.model.late_torque import lost_inertia, rotor
 from hil.estimator.simulation.back_emf import neglected_inertia
 
 MOST_SAMPLES = 1 << 13  # of a period: enough to estimate a noise level to within a tenth
-SUPPOSED = 10.0  # degrees of freedom of white noise in the common level, and of the common level in that of each joint
+SUPPOSED = 10.0  # degrees of freedom assigned to white noise in the common level, and to that level in each joint's
 
 
 def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array:
@@ -40,7 +40,7 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
         information = part.information()
         seen += information
         middle += levels[part.joint] * information
-    # The part of the normal matrix that does not come from the data comes from the prior.
+    # The part of the normal matrix that is not due to the data is due to the prior.
     covariance: Array = inverse @ (normal / lengths - seen + middle) @ inverse / lengths
     return covariance
 
@@ -69,7 +69,9 @@ class _Spectrum:
 
     joint: int
     lines: NDArray[np.complex128]
-    """Jacobian for scaled coordinates (frequencies, coordinates), normalised as in a real orthonormal transform."""
+    """Jacobian for scaled coordinates (frequencies, coordinates), normalised as in an orthonormal real Fourier
+    transform.
+    """
     power: Array
     """Power of the residual (frequencies,); 1 for white noise with the variance that the weights assume."""
     share: Array
@@ -87,7 +89,7 @@ def _spectra(problem: ChainProblem, x: Array, index: int, scale: Array, inverse:
     samples = problem.periods[index].samples
     for joint, (residual, jacobian) in enumerate(problem.weighted(x, index, MOST_SAMPLES)):
         count = len(residual)
-        once = np.full(count // 2 + 1, np.sqrt(2.0 / count))  # every line but the first and last counts twice
+        once = np.full(count // 2 + 1, np.sqrt(2.0 / count))  # all lines but the first and last count twice
         once[0] = np.sqrt(1.0 / count)
         if count % 2 == 0:
             once[-1] = once[0]

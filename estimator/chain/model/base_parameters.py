@@ -24,7 +24,7 @@ ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, i
 SAMPLES = 150
 KINDS = (slice(1, 4), slice(4, 10), slice(10, 11), slice(0, 1))  # moments, inertias, armature, mass
 CLEARLY_INDEPENDENT = 0.1
-"""A column is kept at once if its unexplained part has a norm above this value.
+"""A column is kept immediately if its unexplained part has a norm above this value.
 
 This is the part that the columns kept so far do not explain. Its norm is relative to the largest column of the same
 link and kind.
@@ -32,8 +32,8 @@ link and kind.
 INDEPENDENT = 2e-3
 """A remaining column is kept if its unexplained part (see CLEARLY_INDEPENDENT) has a norm above this value.
 
-Rounded angles such as 1.57 or 1.5708 in a description give every parameter a tiny effect of its own. No recording would
-determine a parameter from that.
+Rounded angles such as 1.57 or 1.5708 in a description give every parameter a tiny separate effect. No recording could
+determine a parameter from such an effect.
 """
 LEAST_FACTOR = 1e-7  # of a group
 NOTHING = 1e-9
@@ -56,8 +56,8 @@ class BaseParameters:
     def of(cls, chain: Chain, seed: int = 1, *, tilts: bool = False) -> "BaseParameters":
         """Return the base parameters of this chain.
 
-        tilts: allow for a tilted base, that is, for any direction of gravity. Gravity may then also act on a vertical
-        first joint, so there are more base parameters.
+        tilts: allow for a tilted base, that is, for any direction of gravity. Gravity may then also act on a first
+        joint with a vertical axis, so there are more base parameters.
         """
         anywhere = replace(chain, gravity=tilted(chain.gravity, *GENERIC)) if tilts else chain
         Y = _random_regressor(anywhere, seed)
@@ -117,7 +117,7 @@ def _norms_by_kind(norm: Array) -> Array:
 
 
 def _independent(Y: Array, order: list[int]) -> Columns:
-    """Return the linearly independent columns of `Y`, in which parameters of one kind have comparable columns."""
+    """Return the indices of linearly independent columns of `Y`, which must be scaled by kind of parameter."""
     left = Y[:, order].copy()
     kept: list[int] = []
 

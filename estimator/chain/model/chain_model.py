@@ -28,7 +28,7 @@ class ChainModel:
     zeros: estimate zero errors of the encoders of all joints but the first, as far as gravity reveals them.
     torque_scale: estimate torque scales of all joints but the first, whose torque constant is trusted.
     base_tilt: estimate the tilt of the base; `base` must come from `BaseParameters.of(..., tilts=True)`.
-    lags: estimate each joint's lag, if `drive` has one, as a ratio to that of the first, since servo models differ.
+    lags: estimate each joint's lag, if `drive` has one, as a ratio to joint 1's, since servo models differ.
     by_voltage: joints (from 1) that are driven by voltage; their back-EMF lags as well.
     added_mass: some periods were recorded with a known mass added, which reveals the first joint's torque constant too.
     Raises ModelError.
@@ -93,14 +93,14 @@ class ChainModel:
 
     @property
     def description(self) -> str:
-        """Text that names the friction model, the options and the drive model."""
+        """Short description of the model: its friction, options and drive."""
         words = {"zeros": self.zeros, "torque scales": self.torque_scale, "base tilt": self.base_tilt}
         words |= {"added mass": self.added_mass, "lags": self._has_lags, "back-EMF": bool(self.by_voltage)}
         return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))
 
     @property
     def _has_lags(self) -> bool:
-        """Whether each joint has a lag of its own."""
+        """Whether each joint has its own lag."""
         return self.lags and "lag" in DRIVE[self.drive]
 
     @property

@@ -70,7 +70,7 @@ def split(chain: Chain, parameters: Array) -> tuple[Array, Array]:
 
 
 def _motion(chain: Chain, *motion: Array) -> tuple[Array, ...]:
-    """Return the arrays of a motion, contiguous, with samples as the first axis."""
+    """Return the arrays of a motion as contiguous arrays with samples along the first axis."""
     shapes = {each.shape for each in motion}
     if len(shapes) != 1 or motion[0].ndim != 2 or motion[0].shape[0] != chain.joints:
         raise ShapeError(

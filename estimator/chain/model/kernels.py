@@ -301,7 +301,7 @@ def regress(column: Any, a: Any, room: Any, Y: Any) -> None:
 
 
 def pull(gravity: Any, room: Any, column: int, out: Any) -> None:
-    """Set a column of `out` (joints, columns) to the torques that hold all links still under this gravity alone.
+    """Set a column of `out` (joints, columns) to the torques that hold all links still under the given gravity.
 
     Call `move` first. The torques are linear in gravity, so passing a change in gravity yields the change in the
     torques.

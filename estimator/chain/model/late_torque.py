@@ -3,7 +3,7 @@
 The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
 product of back-EMF and lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due
 to back-EMF. The lag of a winding cancels at most half of a joint's inertia, namely when the poles of the equivalent
-motor coincide. Far from a fit's minimum, a greater loss is limited to this value.
+motor coincide. Far from a fit's minimum, the computed loss may be greater; it is limited to this value.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,9 +16,9 @@ from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 
 MEANINGS = {"lag_ratio": "ratio of the lag of the joint's current loop to that of joint 1"}
-"""Meanings of the kinds of parameters specific to chains."""
+"""Descriptions of the kinds of parameters that only chains have."""
 PART = 0.1
-"""`limited` names the back-EMF of a joint that contributes more than this to the motion that loses the most inertia."""
+"""`limited` names a joint's back-EMF if it causes more than this fraction of the largest inertia loss in any motion."""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
 _ARMATURE = 10  # of a link's parameters
@@ -91,7 +91,7 @@ def losses(base: BaseParameters, parameters: Mapping[str, float], names: tuple[s
     """
     joints, at = base.chain.joints, {name: index for index, name in enumerate(names)}
     generating = _generating(joints, parameters)
-    if _possible(base, parameters, generating) < 1.0:  # at the limit the loss no longer grows with its causes
+    if _possible(base, parameters, generating) < 1.0:  # at the limit, the loss does not depend on these parameters
         return []
     by_lag, by_ratio = lag_slopes(parameters, joints)
     found = []
@@ -151,7 +151,7 @@ def _most_lost(
     largest, parts = 0.0, np.zeros_like(lost)
     for pose in _POSES[:, : base.chain.joints]:
         mass = mass_matrix(base.chain, every, pose)
-        if np.all(np.isfinite(mass)) and linalg.eigvalsh(mass)[0] > 0.0:  # else it cannot be simulated anyway
+        if np.all(np.isfinite(mass)) and linalg.eigvalsh(mass)[0] > 0.0:  # otherwise it cannot be simulated anyway
             fractions, motions = linalg.eigh(root[:, None] * linalg.inv(mass) * root)
             if fractions[-1] > largest:
                 largest, parts = float(fractions[-1]), np.square(motions[:, -1])

@@ -38,7 +38,7 @@ class PhysicalLinks:
 
 @one_blas_thread
 def nearest_links(base: BaseParameters, value: Array, std: Array, described: Array, armature: Array) -> PhysicalLinks:
-    """Return the links and rotors nearest to the described ones that agree with the identified base parameters.
+    """Return the links and rotors that agree with the identified base parameters and are nearest to the described ones.
 
     Args:
         base: base parameters of the chain.
@@ -120,5 +120,5 @@ def _coordinates(link: Array) -> Array:
 
 
 def _scales() -> Array:
-    """Return the typical step of each coordinate: a factor of e for spreads and mass, centimetres for the centre."""
+    """Return each coordinate's typical step: a factor of e for spreads and mass, otherwise 3 mm or 2 cm."""
     return np.array([1.0, 1.0, 1.0, 1.0, 0.003, 0.003, 0.02, 0.003, 0.02, 0.02])

@@ -35,10 +35,10 @@ FLOOR_SHARE = 0.25
 FIRST_NOISE_SHARE = 0.1
 STANDING = 0.05  # rad/s: below this, dry friction may hold a joint
 STATIC = 1.5  # ratio of static to Coulomb friction
-MOSTLY = 0.5  # filtered indicator of standstill, above which a joint counts as standing
+MOSTLY = 0.5  # filtered indicator of standstill above which a joint counts as standing still
 STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
-VISIBLE_RAD_S = 0.027  # velocity that shows in the register
-CERTAIN = 2.0  # standard deviations within which a torque that friction has held is known
+VISIBLE_RAD_S = 0.027  # smallest velocity that certainly shows in the velocity register
+CERTAIN = 2.0  # standard deviations to subtract from an estimated torque so that the rest certainly acts
 VELOCITY_STD = 0.0135  # rad/s: resolution of the register, plus noise
 NOISE_S = 1.0
 CLIPPED = 9.0
@@ -89,8 +89,8 @@ class ChainObserver:
         self._first = np.array((FIRST_NOISE_SHARE * first) ** 2)
         self._memory[NOISE, :n] = self._first
         drift = LEAST_DRIFT**2 * np.diag(covariance)
-        # Motion in one direction only cannot separate dry friction from an offset, so what may hold a joint at rest is
-        # never taken as less than the friction that was expected.
+        # Motion in one direction only cannot separate dry friction from an offset, so the friction that may hold a
+        # joint at rest is never assumed to be less than was expected.
         floors = FLOOR_SHARE * np.stack((largest, first)), FLOOR_SHARE * frictions
         self._constants = *floors, (0.01 * first) ** 2, drift, interval, dry
         self._chain = base.chain.arrays, places(n, base.columns), base.count
@@ -113,8 +113,8 @@ class ChainObserver:
             torque: torques commanded since the previous sample [N m].
             seconds: time since the previous sample [s].
             is_free: whether the motion of each joint can be assessed; one value for all or one per joint.
-            support: 1 or -1 for each joint that may rest against a stop that blocks motion in this direction, otherwise
-                0 (joints,); None if no joint does.
+            support: 1 or -1 for each joint that may rest against an end stop that blocks motion in this direction,
+                otherwise 0 (joints,); None if no joint does.
         """
         return _observe(
             *(self._memory, self._rests, self._theta, self._covariance, self._constants, self._chain, self._work),
@@ -257,7 +257,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         distance = _look_at_rest(rests[j], q[j], stands, memory[TORQUE, j], row, theta)
         if distance != 0.0:
             variance = 2.0 * quiet * quiet * memory[NOISE, j]
-            if abs(distance) > 2.0 * static:  # otherwise it does not matter, and would take time
+            if abs(distance) > 2.0 * static:  # otherwise it makes no difference and would only cost time
                 variance += _variance(rests[j], distance, row, covariance)
             tolerance = max(TIMES * math.sqrt(variance), quiet * floor)
             momentum = VISIBLE_RAD_S * abs(_own_inertia(rooms, column, theta, base, j))
@@ -266,8 +266,8 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
                 alarm = j
         taught = min(beyond * beyond, CLIPPED * spread) - left_open - rounding
         _teach_noise(memory, j, max(taught, least_noise[j]), dt * (1.0 - stands))
-        # Static friction takes up any torque within its bounds, for as long as a joint stands: nothing can be learned
-        # from it.
+        # Static friction balances any torque within its bounds while a joint stands still, so nothing can be learnt
+        # then.
         if lesson and beyond <= limit and memory[STANDS, j] < MOSTLY and not _is_suspect(rests[j]):
             total = spread + holds * holds
             for i in range(count):

@@ -1,4 +1,4 @@
-"""Open-loop prediction of a motion from given parameters, without measurements but with the arm's own feedback."""
+"""Prediction of a motion from given parameters, using the arm's own feedback but no measurements."""
 
 import numpy as np
 

@@ -2,8 +2,8 @@
 
 At each sample, a goal torque is added to the torque of a software spring and damper, which is computed from the angles
 and velocities of the previous sample, as in the real loop. In between, the motion is integrated by the linearly
-implicit Euler method, with the slope of friction at the old velocity. The feedback at every sample keeps the errors of
-this first-order method small.
+implicit Euler method, with the slope of friction evaluated at the old velocity. The feedback at every sample keeps the
+errors of this first-order method small.
 """
 
 import math
@@ -24,7 +24,7 @@ LONGEST_STEP = 1.3e-3  # s
 RAN_AWAY = 1e3  # rad/s
 NEAR_REST = 0.2  # rad: distance from the rest pose within which the surface under it may support the arm
 YIELDS = 0.03  # rad: how far that surface gives way under a joint's largest torque
-STOP_YIELDS = 0.01  # rad: how far a joint's own stop gives way under its largest torque
+STOP_YIELDS = 0.01  # rad: how far a joint's own end stop gives way under its largest torque
 PRESSED_SHARE = 0.03  # of a joint's largest torque: a smaller gravity torque does not press a joint against the surface
 VISCOUS, COULOMB, OFFSET, WIDTH, SCALE, LAG = range(6)
 DRIVE_TERMS = ("viscous", "coulomb", "offset", "coulomb_width", "torque_scale", "lag")
@@ -73,9 +73,9 @@ class Loop:
     stiffness, damping: gains of the spring [N m/rad] and damper [N m s/rad] towards `pose` (joints,).
     pose: rest pose (joints,) [rad], in which a surface keeps gravity from moving joints further down.
     limit: largest commanded torque (joints,) [N m].
-    stops: side on which each joint rests against its own stop in the rest pose (joints,): -1, 1, or 0 for none; None if
-    no joint does. Such a joint is supported by its stop, not by the surface, whatever the angles of the other joints.
-    Nothing supports a joint whose largest torque is 0.
+    stops: side on which each joint rests against its own end stop in the rest pose (joints,): -1, 1, or 0 for none;
+    None if no joint does. Such a joint is supported by its end stop, not by the surface, whatever the angles of the
+    other joints. Nothing supports a joint whose largest torque is 0.
     pull: torque added to that of the spring and damper; None if they act alone.
     """
 
@@ -91,7 +91,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Pull:
-    """Torque that grows while a joint is off its path, so that friction and unknown weights cannot hold it back.
+    """Torque that grows while a joint is off its path, so that friction and unknown weights cannot keep it there.
 
     path: positions (samples, joints) [rad]. per_second: growth relative to the spring's torque [1/s]. share: maximum of
     this torque, as a fraction of the joint's largest torque.
@@ -249,7 +249,7 @@ def _roll_loop(  # noqa: PLR0912
             place(rotation, translation, axis, q, work[0], work[1])
             move(link, armature, v, work)
             accelerate(armature, gravity, v, still, work)
-            carried = 1.0  # fraction of the surface's stiffness that acts; less further from the rest pose
+            carried = 1.0  # effective fraction of the surface's stiffness; it falls with distance from the rest pose
             for j in range(n):
                 carried = min(carried, 2.0 - 2.0 * abs(q[j] - pose[j]) / NEAR_REST)
             for j in range(n):

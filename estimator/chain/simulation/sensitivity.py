@@ -14,7 +14,7 @@ from hil.estimator.chain.model.tilt import TILT, tilt_slopes, tilted
 from hil.estimator.chain.simulation.stepping import JOINT_TERMS, run
 
 ABSENT = {"coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}
-"""Values that disable terms absent from the model; all other terms are disabled by 0."""
+"""Values that disable terms absent from the model; terms not listed here are disabled by 0."""
 AT_ONCE = 8
 LINE = 8  # numbers in a cache line
 
@@ -24,8 +24,8 @@ class ChainRun:
     """Input of a simulation, taken from a recording: consecutive samples, each with its integration steps."""
 
     torque: Array
-    """Mean motor torque over each step after each sample, not yet multiplied by the torque scales (samples, steps,
-    joints) [N m].
+    """Mean motor torque over each of the steps that follow a sample, not yet multiplied by the torque scales (samples,
+    steps, joints) [N m].
     """
     slopes: Array
     """Derivatives of `torque` with respect to delay and each joint's lag (samples, steps, 2, joints) [N m/s]."""
@@ -34,7 +34,7 @@ class ChainRun:
     step: float
     """Length of an integration step [s]."""
     finer: int = 1
-    """Number of smaller integration steps that replace one step in which a joint may be near standstill."""
+    """Number of smaller steps into which an integration step is divided if a joint may be near standstill during it."""
 
 
 PIECE = 256  # samples whose derivatives fit into the processor's cache

@@ -226,7 +226,7 @@ def _follow(
 
 
 def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:
-    """Return the number of smaller steps, at most `most`, that replace this one.
+    """Return the number of smaller steps, at most `most`, into which to divide this one.
 
     A joint that may pass through the steep part of its friction crosses at most CROSSED widths per smaller step. A
     joint that sticks needs no smaller steps. k: last accelerations.
@@ -337,7 +337,7 @@ def _run_loop(  # noqa: PLR0912
                     _follow(chain, links, p, v1, t, slopes[sample, s], m, gh, columns, work, solve, by, direct)
                     for i in range(n):
                         for j in range(n):
-                            # Derivatives by q and v, and by k through v' = v + h k and through the acceleration.
+                            # Derivatives with respect to q, v, and k (through v' = v + h k and the acceleration).
                             mixed[i, j] = work[6][i, j]
                             mixed[i, n + j] = work[7][i, j] + h * work[6][i, j]
                             mixed[i, 2 * n + j] = h * work[7][i, j] + 2.0 * work[4][i, j]
