@@ -366,7 +366,9 @@ class ServoBus(TorqueSwitch):
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """Index of a joint that has missed many of the latest goals, and text about the value read back; or None."""
+        """Index of a joint that has missed many of the latest goals, and text about the value read back; None if there is
+        none.
+        """
         if (lost := self.prepared.lost) is None:
             return None
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"

@@ -93,9 +93,9 @@ class NoLoad(NamedTuple):
 
 
 class Published(NamedTuple):
-    """A published torque constant: the median, lowest and highest of the figures.
+    """A published torque constant: the median, lowest and highest of the published values.
 
-    It is uncertain even where the figures agree: an individual servo's stall torque can differ by tens of percent. If
+    It is uncertain even where these values agree: an individual servo's stall torque can differ by tens of percent. If
     that matters, measure the constant with a known weight.
     """
 

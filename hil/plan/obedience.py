@@ -123,7 +123,7 @@ class Obedience:
         return True
 
     def suspect(self, found: Residual, velocity: Sequence[float], now: float) -> None:
-        """Begin the tests that the latest exchange calls for. velocity: trusted velocities [rad/s]. now: time of that
+        """Begin the tests that the latest exchange requires. velocity: trusted velocities [rad/s]. now: time of that
         exchange [s].
         """
         for joint, (lacking, torque) in enumerate(zip(found.lacking, found.torque, strict=True)):
@@ -139,7 +139,7 @@ class Obedience:
             if test is None:
                 continue
             lacking, torque = found.lacking[joint], found.torque[joint]
-            if test.lacking is None:  # the goal was taken away with this exchange
+            if test.lacking is None:  # this exchange removed the goal
                 test.lacking, test.torque = lacking, torque
                 test.drives |= _drives(lacking, velocity[joint])
             elif abs(torque) <= ENOUGH * abs(test.torque) or now - test.since > LONGEST_TEST_S:

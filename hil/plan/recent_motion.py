@@ -88,7 +88,7 @@ class RecentMotion:
         return [self._confined(joint, velocity) for joint, velocity in enumerate(state.velocity)]
 
     def speeds(self) -> list[float]:
-        """Speed at which each joint has visibly moved over the longer span [rad/s]; 0 if unknown."""
+        """Speed of each joint over the longer span, derived from its change of position [rad/s]; 0 if unknown."""
         found = []
         for joint, step in enumerate(self._steps):
             travels = self.travels(joint)
@@ -96,8 +96,8 @@ class RecentMotion:
         return found
 
     def contradicts(self, joint: int, velocity: float) -> bool:
-        """Whether a velocity is impossible for the joint: no known change of its position allows it or, if no change is
-        known, no servo of this model turns that fast.
+        """Whether a velocity is impossible for the joint: every known change of its position rules it out or, if no
+        change is known, no servo of this model turns that fast.
         """
         travels = self.travels(joint)
         if not travels:

@@ -66,7 +66,7 @@ class Stabiliser:
         return all(abs(position - pose) <= BALANCED_RAD for position, pose in away)
 
     def add(self, goal: list[float], former: State | None) -> list[float]:
-        """Goal currents [A] with the stabiliser's contribution added. former: the sample before this command."""
+        """Goal currents [A] with the stabiliser's contribution added. former: the latest sample before this command."""
         if former is None:
             return goal
         added, integral = self._added, self._integral

@@ -125,7 +125,7 @@ def _is_number(field: str) -> bool:
 
 
 def _are_units(fields: list[str]) -> bool:
-    """Whether a line states units: at least one is known, and none of the others is a number."""
+    """Whether a line states units: at least one of its fields is a known unit, and none is a number."""
     texts = [field.strip(" []()") for field in fields]
     known = any(unit_of(text) is not None and not text.isdigit() for text in texts)
     return known and not any(text and np.isfinite(_number(text, decimal_comma=True)) for text in texts)
