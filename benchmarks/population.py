@@ -1,10 +1,10 @@
-"""Identification of randomly drawn arms, from the file that `hil init` writes to the verdict, without manual help.
+"""Identification of randomly drawn arms without manual help, starting from the file that `hil init` writes.
 
     python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--others] [--jobs N] [--json] [--keep DIR]
 
 The distribution is described in benchmarks/drawn_arms/population_arms.py, with --others in population_others.py next to
-it. Each arm is identified by `hil identify` in a separate process, in virtual time, and judged by the true parameters
-of the fake arm. --quick: friction = "stribeck" instead of "auto" and half the rate, for tests.
+it. Each arm is identified by `hil identify` in a separate process, in virtual time, and its result is compared
+with the true parameters of the fake arm. --quick: friction = "stribeck" instead of "auto" and half the rate, for tests.
 
 finished              share that ended with a result
 beyond_limit          arms that overshot a position limit by more than hil.dry_run.stopping_distance predicts

@@ -366,8 +366,8 @@ class ServoBus(TorqueSwitch):
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """Index of a joint that has missed many of the latest goals, and text about the value read back; None if there is
-        none.
+        """Index of a joint that has missed many of the latest goals, and text about the value read back; None if no
+        joint has.
         """
         if (lost := self.prepared.lost) is None:
             return None

@@ -1,4 +1,4 @@
-"""Do six servos on four joints, two of them with a second servo, hold 400 Hz at 1 Mbaud?
+"""Whether an arm of four joints, two of which have a second servo, sustains 400 Hz at 1 Mbaud.
 
     python benchmarks/bus/held_rate.py [--seconds 20] [--rounds 3] [--fast | --plain] [--json]
 

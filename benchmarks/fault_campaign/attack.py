@@ -98,7 +98,7 @@ ON_MOTORS = frozenset({Kind.WEAK, Kind.SATURATED, Kind.PUSHED, Kind.GRIPPED, Kin
 }
 ON_INSTRUCTIONS = frozenset({Kind.DEAF, Kind.DEAF_TO_GOALS, Kind.TWICE_TOLD, Kind.GOAL_FIGHT})
 ON_TIME = frozenset({Kind.RIVAL, Kind.HICCUPS})
-"""Attacks that happen again and again from their start to their end."""
+"""Attacks that recur from their start to their end."""
 
 AT_ONCE = frozenset(set(Kind) - ON_REPLIES - FORGED - ON_INSTRUCTIONS - ON_MOTORS - ON_TIME - {Kind.ECHO})
 """Attacks that happen once, at their start time."""

@@ -15,7 +15,7 @@ TOGETHER_S = 0.3
 """Half of the pairs follow each other within this time [s]."""
 
 OFTEN = 0.25
-"""Share of the faults that occur in the phase that needs to be tested often."""
+"""Additional share of the faults that are placed in a phase that is short but needs many tests."""
 
 SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"

@@ -1,4 +1,4 @@
-"""Judges a run by the emulated servos' own record, independently of the program's view.
+"""Judges a run from the emulated servos' own record, independently of the program's view.
 
 The judgement is independent of the kind of fault. For every millisecond it determines from the record whether the
 program received correct data, received anything, was obeyed, and kept the arm within its limits and near its
@@ -46,7 +46,9 @@ LIE_RAD, LIE_RAD_S, LIE_SHARE = 0.1, 0.5, 0.1
 """Tolerances for the position and velocity reported to the program; the velocity also has a relative tolerance."""
 
 UNSURE_MS = 20
-"""How much earlier than an attack its effect may appear in the record [ms], which is written once the bus is used."""
+"""How much earlier than the attack its effect may appear in the record [ms], because the record is only written when
+the bus is used.
+"""
 
 SHORTEST_WATCHDOG_S = 0.04
 """Shortest practicable timeout of the Bus Watchdog [s]. It counts in steps of 20 ms, and with one step, it would trip
@@ -60,7 +62,7 @@ ASTRAY_RAD, ASTRAY_SHARE = 0.1, 0.35
 """Tolerance for the deviation from the undisturbed motion, absolute and relative to the range of that motion."""
 
 DRIVES_MS = 15
-"""Longest time for which a goal along a visible motion may exceed all goals of the undisturbed run [ms]."""
+"""Longest time for which a goal in the direction of visible motion may exceed all goals of the undisturbed run [ms]."""
 
 DRIVES_SHARE, DRIVES_TICKS, DRIVES_S = 1.2, 5, 0.01
 """Ratio to the largest goal of the undisturbed run above which a goal is too large; smallest change of position that
@@ -396,7 +398,7 @@ def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int
 
 
 class Told:
-    """The goals that the program sent, and the replies that it received from shortly before the first fault on."""
+    """The goals that the program sent, and the replies that it received from shortly before the first fault onwards."""
 
     def __init__(self, config: Config, traffic: Traffic, start: float) -> None:
         self._joints = config.joints

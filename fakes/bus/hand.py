@@ -31,7 +31,7 @@ _PULL_S = 0.01
 
 
 _FASTEST_RAD_S = 200.0
-"""Greatest mean velocity of a movement [rad/s]; simulated gears and stops do not survive much more."""
+"""Greatest mean velocity of a movement [rad/s]; much more would break the simulated gears and hard stops."""
 
 _MOST_TICKS = 1 << 20
 """Largest Present Position of a servo in either direction: 256 turns."""

@@ -25,7 +25,7 @@ from hil.plan.chain_model import ChainTorque, KnownChain, described_torque, know
 from hil.plan.plan import Plan, Segment, make_plan, plan_with
 
 SETTLE_IN = 0.3  # s over which the feed-forward is faded in and out
-TORQUE_SHARE = 0.8  # fraction of a joint's torque limit that a path may use; the rest is a margin for errors of the assumed model
+TORQUE_SHARE = 0.8  # fraction of a joint's torque limit that a path may use; the rest allows for model errors
 
 
 @dataclass(frozen=True)

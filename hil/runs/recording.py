@@ -164,7 +164,7 @@ class Recorder:
             lost = self._save_again()
         except OSError as error:
             lost = RunFolderError(
-                f"{self._path} cannot be cut to its {self.count} samples ({error.strerror}), but holds all of them."
+                f"{self._path} cannot be truncated to its {self.count} samples ({error.strerror}), but holds all of them."
             )
         else:
             return
