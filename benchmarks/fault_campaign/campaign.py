@@ -54,11 +54,11 @@ FREE = frozenset({"Goal Position", "Registered Instruction"})
 """Registers that a servo writes itself, independently of any program."""
 
 _LIMITS_LEFT = frozenset({Kind.KILLED, Kind.LOWERED_LIMIT})
-"""The first start after this pair finds the limit as the other program left it; the second one, as the killed run."""
+"""After this pair, the first start finds the limit as the other program left it; the second, as the killed run did."""
 
 _PACKAGE = "benchmarks.fault_campaign"
 _ARMS = (1, 12)
-"""Numbers of arms on which stops are simulated: the larger one only if the overshoot exceeds that of the first arm."""
+"""Numbers of arms for which stops are simulated; the second is needed only if the overshoot exceeds the first's."""
 
 _CHECKED_CYCLES = 8
 """Cycles per mode in the next start's `hil check`, which only has to restore settings here."""

@@ -12,7 +12,7 @@ PAIRS = 0.35
 """Probability that an injection consists of two faults."""
 
 TOGETHER_S = 0.3
-"""Half of the pairs follow each other within this time [s]."""
+"""In half of the pairs, the two faults are at most this far apart [s]."""
 
 OFTEN = 0.25
 """Additional share of the faults that are placed in a phase that is short but needs many tests."""

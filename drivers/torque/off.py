@@ -51,7 +51,7 @@ class TorqueOff:
     rebooted: confirmed joints whose servos were reset, which disarmed the watchdog armed before torque was switched on.
     disarmed: confirmed joints whose servos were not reset, but whose watchdog another program switched off.
     tripped: joints whose Bus Watchdog may have tripped, which zeroes their goals; it has been cleared since.
-    driven: joints that are neither confirmed nor unconfirmed, because another program switches their servos' torque on whenever it is cut.
+    driven: the remaining joints, because another program switches their servos' torque on whenever it is cut.
     """
 
     confirmed: tuple[Joint, ...]

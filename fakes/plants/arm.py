@@ -160,8 +160,8 @@ def base_parameters(arm: Arm | None, time: float = math.inf) -> dict[str, float]
     Empty if `arm` is None, since the parameters of other plants are unknown. By default, the drives are warm.
 
     Effects that no base parameter represents are left out: dry friction beyond Coulomb friction (Stribeck rise, load),
-    presliding, the current loop's lag, saturation, ripple, cogging, a cable's stiffness, backlash, hard stops. The `gravity`
-    values are those of the tilted plane; an offset includes a cable's torque at angle 0.
+    presliding, the current loop's lag, saturation, ripple, cogging, a cable's stiffness, backlash, hard stops. The
+    `gravity` values are those of the tilted plane; an offset includes a cable's torque at angle 0.
     """
     if arm is None:
         return {}

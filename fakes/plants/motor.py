@@ -1,5 +1,5 @@
-"""The drive of one joint during a time step: current lag, torque, friction, hard stops. This code runs in every step, so
-it uses plain floats.
+"""The drive of one joint during a time step: current lag, torque, friction, hard stops. This code runs in every step,
+so it uses plain floats.
 
 Presliding friction follows Canudas de Wit, Olsson, Astrom and Lischinsky (IEEE Transactions on Automatic Control 40
 (1995) 419): bristles deflect with the joint and slip,

@@ -24,7 +24,7 @@ A stronger brake stops the arm hardly any sooner, and throws it back farther if 
 LIGHTEST = 0.5
 """Smallest inertia that a joint is assumed to have, relative to the typical rotor inertia of its servo.
 
-Before the velocity can be read again, a light joint that is braked too hard is thrown back faster than it came.
+A light joint that is braked too hard would be moving backwards, faster than before, when its velocity is next read.
 """
 
 DELAY_S = 0.002
@@ -37,8 +37,8 @@ Some increase is normal: gravity and the other joint's brake act on the joint.
 """
 
 STILL_FASTER, SLOWS_AFTER_S = 0.06, 0.02
-"""The corresponding fraction once braking has lasted for the given time [s]. Otherwise, a reversed motor could drive a
-joint with a high velocity limit until braking ends.
+"""Once it has lasted for the given time [s], braking is abandoned if the speed increases by this smaller fraction of
+the velocity limit. Otherwise, a reversed motor could drive a joint with a high velocity limit until braking ends.
 """
 
 NOTICED_AFTER = 2

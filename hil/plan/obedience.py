@@ -34,8 +34,8 @@ MOST_TURNED = 3.0
 """Ratio of drops, as in `TURNED`, above which the unexplained torque did not come from the joint's motor alone."""
 
 UNEVEN = 0.3
-"""Largest deviation from a proportional drop, relative to the total drop: if the unexplained torque deviates more from
-a drop in proportion to the joint's own torque, it has another cause.
+"""Largest deviation of the unexplained torque from a drop in proportion to the joint's own torque, relative to the
+total drop; a larger deviation shows that it has another cause.
 """
 
 MOST_UNEVEN = 3

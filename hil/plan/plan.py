@@ -70,7 +70,7 @@ class Plan:
     rest_samples: int
     end_samples: int
     brake_samples: int
-    """Largest number of exchanges during which a stop brakes."""
+    """Largest number of exchanges for which a stop brakes the joints."""
     max_settling_periods: int
     periods: int
     settle_within: float
@@ -103,7 +103,7 @@ class Plan:
 
 
 def scaled(config: Config, plan: Plan, peak_torque: Array) -> Plan:
-    """The same waves scaled to other peak torques (joints,) [N m]."""
+    """The same plan with its multisines scaled to other peak torques (joints,) [N m]."""
     return replace(plan, segments=tuple(_scaled_segment(config, segment, peak_torque) for segment in plan.segments))
 
 

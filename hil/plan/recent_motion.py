@@ -132,7 +132,7 @@ class RecentMotion:
         return abs(velocity) > self._fastest[joint]
 
     def travels(self, joint: int) -> list[Travel]:
-        """The changes of a joint's position over the short and the long span; none if the joint has been seen only
+        """The changes of a joint's position over the short and the long span; none if the joint has replied only
         once.
         """
         states = [state for state in self._states if not isnan(state.position[joint])]

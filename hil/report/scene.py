@@ -38,8 +38,8 @@ def spatial_motion(
 ) -> SpatialMotion:
     """The motion (joints, samples) [rad] of a configured spatial arm.
 
-    ways: number of samples at the beginning and at the end that lead from and to the rest pose, where distances less
-    than the margin are allowed. Raises ConfigError, ArmFileError.
+    ways: numbers of samples at the beginning and at the end in which the arm moves from and to the rest pose; there,
+    distances below the margin are allowed. Raises ConfigError, ArmFileError.
     """
     space = Space.of(config)
     step = _frame_step(position)

@@ -34,7 +34,7 @@ class RunSummary:
     """Summary of one run.
 
     started: None if run.json does not contain it. verdict: "yes", "with care", "no", or what is missing. residual:
-    largest residual of any joint in encoder steps; None without a result. steps: number of pilot and intermediate runs in
+    that of the worst joint in encoder steps; None without a result. steps: number of pilot and intermediate runs in
     the run folder.
     """
 
