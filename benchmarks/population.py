@@ -99,7 +99,7 @@ class Outcome:
 
 
 def run(seed: int, folder: Path, *, quick: bool = False, others: bool = False) -> Outcome:
-    """Identify the arm of this seed in a separate process, and judge the outcome."""
+    """Identify the arm for this seed in a separate process, and judge the outcome."""
     arm = draw_other(seed) if others else draw(seed)
     if quick:
         arm = replace(arm, toml=_quicker(arm.toml))
@@ -255,7 +255,7 @@ def figures(outcomes: list[Outcome]) -> dict[str, Any]:
 def study(
     seeds: list[int], jobs: int, keep: Path | None, tell: Any = None, *, quick: bool = False, others: bool = False
 ) -> list[Outcome]:
-    """Identify the arm of each seed. tell: function that is called with each outcome."""
+    """Identify the arm for each seed. tell: function called with each outcome."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = (keep or Path(temporary)).absolute()
         return each(partial(_run_in, folder, quick, others), seeds, count=jobs, tell=tell or (lambda _: None))

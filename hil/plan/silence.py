@@ -8,7 +8,7 @@ WATCHDOG_SHARE = 0.8
 """Upper bound on both limits, relative to the watchdog timeout."""
 
 _FEWEST_MISSING = 2
-"""Smallest number of missing replies that counts as a fault: however low the rate, one lost packet is not enough."""
+"""Minimum number of missing replies that counts as a fault: however low the rate, one lost packet is not enough."""
 
 _ROUNDING_S = 1e-6
 

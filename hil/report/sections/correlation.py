@@ -1,4 +1,4 @@
-"""Section on correlated parameters, which the data can hardly distinguish."""
+"""Section on correlated parameters, which the data can barely distinguish."""
 
 import numpy as np
 
