@@ -243,7 +243,7 @@ def classic(setup: Setup, period: SettledPeriod, held_out: SettledPeriod, path: 
 
 
 def foretold(model: ChainModel, parameters: dict[str, float], held_out: SettledPeriod) -> float | None:
-    """Error of the free prediction [%], worst joint; None if the simulation with these parameters diverges."""
+    """Prediction error on the held-out path [%], worst joint; None if the simulation with these parameters diverges."""
     try:
         return 100 * float(relative_error(held_out.position, predict(model, parameters, held_out)).max())
     except PeriodicityError:

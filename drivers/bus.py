@@ -223,7 +223,7 @@ class ServoBus(TorqueSwitch):
         self._exchange = exchange
 
     def add_read_back(self, exchange: ReadBackExchange) -> None:
-        """Make `exchange` read back the servos' goals, Torque Enable and settings, and expect the present settings."""
+        """Make `exchange` read back the servos' goals, Torque Enable, and the settings, which must not change."""
         modes = [drive.mode for drive in self._drives]
         settings = [[servo.read(name) for name in SETTINGS] for servo in self._servos.values()]
         exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in self._servos.values()]), settings)

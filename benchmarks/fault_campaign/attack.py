@@ -188,7 +188,7 @@ def blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
 
 
 def _fast_blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
-    """Do the same for a fast answer, which is never byte-stuffed, up to the first wrong CRC."""
+    """Like `blocks_in`, for a fast answer, which is never byte-stuffed; stop at the first wrong CRC."""
     found: dict[int, tuple[int, bytes]] = {}
     length = 1 + (request.length + 4) * len(request.ids)
     start = data.rfind(HEADER + b"\xfe" + length.to_bytes(2, "little"))  # an answer to another request may be pending

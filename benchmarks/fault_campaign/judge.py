@@ -331,7 +331,7 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
 
 
 def _not_before(what: str, when: float, helpless: Sequence[tuple[float, float]]) -> float:
-    """When the current had to end [s] for a failure at `when`; for silence, not before something could end it."""
+    """When the current had to end [s] after a failure at `when`; if a servo was silent, once something could end it."""
     until = [end for since, end in helpless if since <= when < end]
     return max([when, *until]) if what.endswith("was not heard") else when
 

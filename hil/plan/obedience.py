@@ -114,7 +114,7 @@ class Obedience:
     def question(self, joint: int, now: float) -> bool:
         """Begin a test of a joint that speeds up although its torque opposes the motion. now: time [s].
 
-        Returns False if a test has just been inconclusive, in which case the motor is to blame.
+        Returns False if a test has just been inconclusive, in which case the motor counts as reversed.
         """
         if now < self._doubted_until[joint]:
             return False

@@ -1,8 +1,8 @@
 """Range of velocities that each joint's change of position allows: no brake may rely on a reported velocity alone.
 
-A brake that trusted a false velocity would drive the joint. Therefore the velocity to brake against is the reported
-one, confined to the range that the change of position allows over two spans of time: a short one, which soon shows a
-reversal, and a long one, in which a slow motion is visible despite the encoder's steps. Each range includes zero, but
+A brake that trusted a false velocity would drive the joint. The brake therefore opposes the reported velocity only
+once it is limited to the range that the change of position allows over two spans of time: a short one, which soon shows
+a reversal, and a long one, in which a slow motion is visible despite the encoder's steps. Each range includes zero, but
 excludes the direction opposite to a visible motion.
 """
 

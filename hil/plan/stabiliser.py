@@ -84,7 +84,7 @@ class Stabiliser:
 def too_slow(config: Config) -> str:
     """Explain why the rate is too low for the stabiliser, and what to do; "" if it is high enough.
 
-    A spring whose torque is late by `delay` drives the motion like a negative damper of stiffness times `delay`. The
+    A spring whose torque is delayed by `delay` acts like negative damping of magnitude stiffness times `delay`. The
     joint oscillates unless the configured damping and the servo's typical viscous friction together outweigh it.
     """
     if config.stabiliser is None:

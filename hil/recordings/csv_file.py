@@ -15,7 +15,8 @@ from hil.runs.file_size import MOST_CSV_BYTES
 _REMARKS = ("#", "%", "//")
 
 _LARGEST = 1e30
-"""Largest absolute value that is read as a number. Time stamps in nanoseconds, the largest in use, are about 1e18."""
+"""Largest absolute value that is read as a number; the largest in practice are time stamps in nanoseconds (about 1e18).
+"""
 
 
 def read_csv_table(path: Path) -> Table:

@@ -1,4 +1,4 @@
-"""Rejection of angles, torques, currents and voltages that no servo arm reaches, usually because no unit is stated.
+"""Rejection of angles, torques, currents and voltages that no servo arm reaches, which usually lack a stated unit.
 
 Joints that rotate continuously are accepted, and so is everything if [columns] states the unit. A torque, current or
 voltage is also accepted if its column states the unit.

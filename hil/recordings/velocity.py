@@ -80,7 +80,7 @@ def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
 
 
 def _factors(found: Sequence[Rate]) -> list[float]:
-    """The factors of all columns relative to the known unit that suits them best."""
+    """The factors of all columns, relative to the known unit of velocity that fits them best."""
     unit = min(KNOWN_UNITS, key=lambda each: max((abs(math.log(rate.factor / each)) for rate in found), default=0.0))
     return [rate.factor / unit for rate in found]
 

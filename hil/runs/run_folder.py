@@ -376,7 +376,7 @@ def _has_samples(path: Path) -> bool:
 
 @cache
 def _versions() -> dict[str, str]:
-    """Return the versions of the packages that a result depends on; reading them takes as long as 100 exchanges."""
+    """Return the versions of the packages that a result depends on; reading them takes as long as 100 bus exchanges."""
     return {name: version(name) for name in _PACKAGES}
 
 
