@@ -1,4 +1,4 @@
-"""Attacks on the bytes between host and servos by a man in the middle, and attacks on the servos themselves."""
+"""Man-in-the-middle attacks on the bytes between host and servos, and attacks on the servos themselves."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -2,8 +2,8 @@
 
 The judgement is independent of the kind of fault. For every millisecond it determines from the record whether the
 program received correct data, received anything, was obeyed, and kept the arm within its limits and near its
-undisturbed motion. From the first moment at which one of these fails permanently, the current must end within
-`BOUND_MS`.
+undisturbed motion. From the first moment at which one of these conditions fails permanently, the current must end
+within `BOUND_MS`.
 """
 
 import re
@@ -504,7 +504,7 @@ def _beyond(config: Config, joint: int, own: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _begins(record: NDArray[Any]) -> int:
-    """The millisecond in which motors drive the arm for the first time."""
+    """The millisecond in which motors first drive the arm."""
     return int(np.argmax(record["driven"].any(axis=1)))
 
 

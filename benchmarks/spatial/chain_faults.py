@@ -93,7 +93,7 @@ WEAKER = 0.3
 """Force that a motor can overcome in any pose on the path home, relative to the largest motor torque of the run."""
 
 SETTLES_S = 1.0
-"""Time beyond the predicted lowering that a stop may take [s]."""
+"""Time that a stop may take beyond the predicted duration of lowering [s]."""
 
 LIES_RAD = 0.1
 LOOKED_AT_MS = 5
