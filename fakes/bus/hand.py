@@ -56,7 +56,7 @@ class Move(Described):
             gt=0,
             le=600,
             allow_inf_nan=False,
-            description="duration of the movement [s]; longer above 200 rad/s on average",
+            description="duration of the movement [s]; extended if the mean velocity would exceed 200 rad/s",
         ),
     ] = 1.0
     hold: Annotated[float, Field(ge=0, description="how long the joint is held afterwards [s]")] = math.inf

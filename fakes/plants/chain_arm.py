@@ -65,7 +65,7 @@ class ChainArm(Described):
             if least < -1e-12:
                 raise ValueError(
                     f'{self.urdf}: the fake arm cannot be simulated, because the inertia of link "{joint.link}" has a '
-                    f"negative principal moment ({least:.2g} kg m^2): correct its ixx to izz"
+                    f"negative principal moment ({least:.2g} kg m^2): correct its inertia (ixx to izz)"
                 )
         return self
 
