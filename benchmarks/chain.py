@@ -8,7 +8,7 @@ friction with a Stribeck rise, and a current-loop lag of 1 ms. Each follows a fi
 feed-forward from the inaccurate model and a software spring and damper; angles are rounded to 4096 steps per turn and
 currents to the servo's ticks. One settled period is recorded; a second path is held out.
 
-Figures for each number of joints, worst of all seeds:
+Figures for each number of joints, worst over all seeds:
 
 torque_error_percent   rigid-body torque on the held-out path: RMS error divided by RMS torque, worst joint
 base_median_percent    median error of the base parameters that contribute at least a tenth of some joint's torque
@@ -243,7 +243,7 @@ def classic(setup: Setup, period: SettledPeriod, held_out: SettledPeriod, path: 
 
 
 def foretold(model: ChainModel, parameters: dict[str, float], held_out: SettledPeriod) -> float | None:
-    """Error of the free prediction [%], worst joint; None if the simulation with these parameters diverges."""
+    """Prediction error on the held-out path [%], worst joint; None if the simulation with these parameters diverges."""
     try:
         return 100 * float(relative_error(held_out.position, predict(model, parameters, held_out)).max())
     except PeriodicityError:
@@ -297,7 +297,7 @@ def _compiled(joints: int, seed: int) -> dict[str, Any]:
 
 
 def worst(found: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the worst of each figure over all seeds (None if it is missing for a seed), but the mean coverage."""
+    """Return the worst value of each figure over all seeds (None if a seed lacks it); for the coverage, the mean."""
     result: dict[str, Any] = {}
     for key, first in found[0].items():
         each = [one[key] for one in found]
@@ -318,9 +318,9 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument(
-        "--jobs", type=int, default=1, help="number of workers; with more than one, times are disturbed"
+        "--jobs", type=int, default=1, help="number of workers; with more than one, timings are unreliable"
     )
-    parser.add_argument("--peers", action="store_true", help="also mujoco.sysid (hil[peers]), some minutes")
+    parser.add_argument("--peers", action="store_true", help="also run mujoco.sysid (hil[peers]), for some minutes")
     parser.add_argument("--joints", type=int, nargs="+", default=[4, 6], choices=sorted(BENCHES))
     given = parser.parse_args()
     result: dict[str, Any] = {"arms": {}}

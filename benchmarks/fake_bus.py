@@ -103,7 +103,7 @@ def _timed(cls: type, name: str, spent: dict[str, float], key: str) -> Callable[
 
 
 def _timed_stream(spent: dict[str, float], arm_seconds: list[float]) -> Callable[[], None]:
-    """Add the CPU time of `Stream.run` to `spent["stream"]` and append the arm's time; return the undoing function."""
+    """Add the CPU time of `Stream.run` to `spent["stream"]`, and append the arm's time; return an undo function."""
     original = Stream.run
 
     def run(self: Stream) -> None:

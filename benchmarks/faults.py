@@ -4,7 +4,7 @@
 
 Each injection is one `hil record` in virtual time with one or two faults: of the fake bus, of the computer, by other
 programs on the bus, or by a man in the middle who changes, delays, repeats, forges and drops bytes between program and
-servos. It is judged by the emulated servos' own record of every millisecond (fault_campaign/judge.py):
+servos. It is judged from the emulated servos' own record of every millisecond (fault_campaign/judge.py):
 
 unsafe          current flowed for more than 100 ms after the first permanent failure (for more than the watchdog's
                 timeout if the program cannot reach the servo), or still flowed after the end of the program

@@ -1,10 +1,10 @@
-"""Identification of randomly drawn arms, from the file that `hil init` writes to the verdict, without manual help.
+"""Identification of randomly drawn arms without manual help, starting from the file that `hil init` writes.
 
     python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--others] [--jobs N] [--json] [--keep DIR]
 
 The distribution is described in benchmarks/drawn_arms/population_arms.py, with --others in population_others.py next to
-it. Each arm is identified by `hil identify` in a separate process, in virtual time, and judged by the true parameters
-of the fake arm. --quick: friction = "stribeck" instead of "auto" and half the rate, for tests.
+it. Each arm is identified by `hil identify` in a separate process, in virtual time, and its result is compared
+with the true parameters of the fake arm. --quick: friction = "stribeck" instead of "auto" and half the rate, for tests.
 
 finished              share that ended with a result
 beyond_limit          arms that overshot a position limit by more than hil.dry_run.stopping_distance predicts
@@ -99,7 +99,7 @@ class Outcome:
 
 
 def run(seed: int, folder: Path, *, quick: bool = False, others: bool = False) -> Outcome:
-    """Identify the arm of this seed in a separate process, and judge the outcome."""
+    """Identify the arm for this seed in a separate process, and judge the outcome."""
     arm = draw_other(seed) if others else draw(seed)
     if quick:
         arm = replace(arm, toml=_quicker(arm.toml))
@@ -255,7 +255,7 @@ def figures(outcomes: list[Outcome]) -> dict[str, Any]:
 def study(
     seeds: list[int], jobs: int, keep: Path | None, tell: Any = None, *, quick: bool = False, others: bool = False
 ) -> list[Outcome]:
-    """Identify the arm of each seed. tell: function that is called with each outcome."""
+    """Identify the arm for each seed. tell: function called with each outcome."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = (keep or Path(temporary)).absolute()
         return each(partial(_run_in, folder, quick, others), seeds, count=jobs, tell=tell or (lambda _: None))

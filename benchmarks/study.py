@@ -160,7 +160,7 @@ def killed(folder: Path, runs: int) -> dict[str, Any]:
     process.kill()
     process.wait()
     kept = len(Dataset(out / "rows").done())
-    assert kept < runs, f"all {runs} runs were done before the engine was killed: give --killed more"
+    assert kept < runs, f"all {runs} runs were done before the engine was killed: increase --killed"
     subprocess.run([*command, "--resume"], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     dataset = Dataset(out / "rows")
     rows = dataset.table().column("run").to_pylist()

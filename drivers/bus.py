@@ -223,7 +223,7 @@ class ServoBus(TorqueSwitch):
         self._exchange = exchange
 
     def add_read_back(self, exchange: ReadBackExchange) -> None:
-        """Make `exchange` read back the servos' goals, Torque Enable and settings, and expect the present settings."""
+        """Make `exchange` read back the servos' goals, Torque Enable, and the settings, which must not change."""
         modes = [drive.mode for drive in self._drives]
         settings = [[servo.read(name) for name in SETTINGS] for servo in self._servos.values()]
         exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in self._servos.values()]), settings)
@@ -366,7 +366,9 @@ class ServoBus(TorqueSwitch):
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """Index of a joint that has missed many of the latest goals, and text about the value read back; or None."""
+        """Index of a joint that has missed many of the latest goals, and text about the value read back; None if no
+        joint has.
+        """
         if (lost := self.prepared.lost) is None:
             return None
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"

@@ -50,7 +50,9 @@ supply voltage: supplies sag, and resistance and no-load speed differ by tens of
 """
 
 LEAST_OF_MEASURED = 0.75
-"""Replaces `LEAST_SUPPLY` if the supply was measured, since it may sag between two readings, and motors differ."""
+"""Replaces `LEAST_SUPPLY` if the supply was measured. It is not 1, because motors differ and the supply may sag between
+two readings.
+"""
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
 """A current below the first fraction of its goal may also be due to switched-off torque. The second value then replaces
@@ -93,9 +95,9 @@ class NoLoad(NamedTuple):
 
 
 class Published(NamedTuple):
-    """A published torque constant: the median, lowest and highest of the figures.
+    """A published torque constant: the median, lowest and highest of the published values.
 
-    It is uncertain even where the figures agree: an individual servo's stall torque can differ by tens of percent. If
+    It is uncertain even where these values agree: an individual servo's stall torque can differ by tens of percent. If
     that matters, measure the constant with a known weight.
     """
 

@@ -27,7 +27,7 @@ class Turns:
         """Number of cycles since the previous sample that have not yet been counted."""
 
     def count(self, left: int) -> None:
-        """Count the cycles run so far. left: number of planned cycles not yet run (-1 if one more was run)."""
+        """Count the cycles run so far. left: number of planned cycles not yet run (-1 if one more has been run)."""
         passed = self.usual - left
         self._until_status -= passed
         self._until_slow -= passed - self.between

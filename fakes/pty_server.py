@@ -39,9 +39,9 @@ LONGEST_SLEEP_S = 0.05
 """Longest wait before the server checks for faults, watchdog trips and a request to stop [s]."""
 
 MOST_AHEAD_S = 0.02
-"""Wire time of bytes that the server takes from the terminal before they are due [s].
+"""Largest wire time of the bytes that the server takes from the terminal before they are due [s].
 
-Beyond it, they wait in the terminal, and a host that goes on writing blocks when that is full, as with a real adapter.
+Further bytes wait in the terminal; once it is full, a host that continues to write blocks, as with a real adapter.
 """
 
 PRIORITY = 10

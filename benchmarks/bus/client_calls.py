@@ -230,7 +230,7 @@ def lerobot_bus(device: str) -> Iterator[Call]:
 
 
 def lerobot_koch(device: str) -> Iterator[Call]:
-    """Calls of LeRobot's unmodified KochFollower on koch; `hil hand` takes the place of the person."""
+    """Calls of LeRobot's unmodified KochFollower on koch; `hil hand` stands in for the person."""
     import tempfile
     from pathlib import Path
 

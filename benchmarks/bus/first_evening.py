@@ -26,13 +26,13 @@ MOST_ARM_S = 720.0
 
 
 def main() -> None:
-    """Type the page's commands and print the outcome."""
+    """Run the page's commands and print the outcome."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arm", type=Path, default=CONFIGS / "first_time.toml", help="the fake arm's file")
-    parser.add_argument("--out", type=Path, help="folder to type in, which must be new")
+    parser.add_argument("--out", type=Path, help="folder in which to run the commands; it must be new")
     parser.add_argument("--virtual", action="store_true", help="in virtual time, independent of the computer's load")
     parser.add_argument(
-        "--patient", action="store_true", help="after init, let servos be silent for 90 ms: for a computer that is busy"
+        "--patient", action="store_true", help="after init, tolerate 90 ms without replies, for a busy computer"
     )
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
@@ -51,11 +51,11 @@ def main() -> None:
         if not chosen.json:
             print(f"arm time {moved:.0f} s at {rate:g} Hz")
         if moved > MOST_ARM_S:
-            faults.append(f"the arm moved for {moved:.0f} s, at most {MOST_ARM_S:.0f} s are allowed")
+            faults.append(f"the arm moved for {moved:.0f} s; at most {MOST_ARM_S:.0f} s is allowed")
     if chosen.json:
         print(json.dumps({"commands": len(done), "faults": faults, "arm_seconds": moved}))
     else:
-        print("\n".join(faults) or f"All {len(done)} commands worked, each named the next.")
+        print("\n".join(faults) or f"All {len(done)} commands worked, and each named the next.")
     raise SystemExit(bool(faults))
 
 

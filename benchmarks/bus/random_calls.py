@@ -115,7 +115,7 @@ class Client:
                 self.look(servo_id, row)
 
     def step(self) -> None:
-        """One random call."""
+        """Make one random call."""
         kinds: list[tuple[int, Callable[[], None]]] = [
             (30, self.write),
             (8, self.write_neighbours),
@@ -178,7 +178,7 @@ class Client:
         self._write("write", servo_id, row.address, self._value(row))
 
     def write_neighbours(self) -> None:
-        """Two registers, the second of which begins where the first ends."""
+        """Write two registers, the second of which begins where the first ends."""
         servo_id = self._servo()
         first = self._row(servo_id)
         second = self.servos[servo_id].rows.get(first.span.stop)
@@ -263,7 +263,7 @@ class Client:
         self.compare(f"ping {servo_id}", answer, answer == wanted)
 
     def sync_write(self) -> None:
-        """A group write, which has no answer: each servo accepts or refuses its own value."""
+        """Send a group write, which has no answer: each servo accepts or refuses its own value."""
         row = self._row(1)
         group = sdk.GroupSyncWrite(self.port, self.handler, row.address, row.size)
         for servo_id, rules in self.servos.items():

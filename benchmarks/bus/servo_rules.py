@@ -1,7 +1,7 @@
 """What a servo answers and stores according to ROBOTIS' manual alone: the oracle of `random_calls` and `conversations`.
 
-Written from the e-Manual's control tables and protocol page, without the fake's code, so that a difference between the
-two is settled by the manual. Where the manual is silent or vague, the oracle allows several answers, or treats the
+Written from the e-Manual's control tables and protocol page, without the fake's code, so that the manual settles any
+difference between the two. Where the manual is silent or vague, the oracle allows several answers, or treats the
 value of a register as unknown until it is read again.
 """
 

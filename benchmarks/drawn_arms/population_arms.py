@@ -55,7 +55,7 @@ class DrawnArm:
 
 
 def draw(seed: int) -> DrawnArm:
-    """Draw the arm of this seed."""
+    """Draw the arm for this seed."""
     random = np.random.default_rng((13, seed))
     joints = 1 if random.random() < 0.3 else 2
     models = _models(random, joints)

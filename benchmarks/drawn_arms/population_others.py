@@ -48,7 +48,7 @@ TURN = 4096
 
 
 def draw(seed: int) -> DrawnArm:
-    """Draw the arm of this seed."""
+    """Draw the arm for this seed."""
     random = np.random.default_rng((29, seed))
     joints = 1 if random.random() < 0.3 else 2
     models = _models(random, joints)

@@ -69,8 +69,8 @@ class Arm:
 
 
 def drawn_arm(random: np.random.Generator) -> Arm:
-    """Draw links of 0.12 to 0.3 m and one of three friction laws: two have a Stribeck rise, one of these also depends
-    on load."""
+    """Draw links of 0.12 to 0.3 m and one of three friction laws: two have a Stribeck rise, and one of these also
+    depends on load."""
     m1, m2, elbow = random.uniform((0.1, 0.08, 0.06), (0.35, 0.3, 0.1))
     l1, l2 = random.uniform(0.12, 0.3, 2)
     c1, c2 = random.uniform(0.3, 0.6) * l1, random.uniform(0.35, 0.6) * l2

@@ -2,10 +2,10 @@
 
     python benchmarks/effects/presliding.py [--json] [--seeds N] [--stiffness 1000 200 50 15 5] [--law slip]
 
-The realistic fake arm without its bus. Its dry friction acts as a spring of this stiffness [N m/rad] before it slides,
-with a damping ratio of 0.7. Both models include Stribeck friction. With `--law slip`, the arm follows a law that the
-estimator does not have (benchmarks/effects/elastic_slip.py). The figures are the worst of N seeds; `gained` is the
-smallest ratio of the held-out errors of the models without and with presliding.
+The arm is the realistic fake arm without its bus. Its dry friction acts as a spring of this stiffness [N m/rad] before
+it slides, with a damping ratio of 0.7. Both models include Stribeck friction. With `--law slip`, the arm follows a law
+that the estimator does not have (benchmarks/effects/elastic_slip.py). The figures are the worst of N seeds; `gained` is
+the smallest ratio of the held-out errors of the models without and with presliding.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Figures of the report, the exports, the model in Python and the package.
+"""Benchmark figures for the report, the exports, the model in Python and the package.
 
     python benchmarks/effects/takeaway.py [--json]
 

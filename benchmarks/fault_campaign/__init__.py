@@ -1,1 +1,1 @@
-"""Random faults against the complete program, judged by what the emulated servos themselves recorded."""
+"""Random faults against the complete program, judged from the emulated servos' own record."""

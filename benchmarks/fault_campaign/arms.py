@@ -12,7 +12,7 @@ PERIOD_S = 2.0
 SCHEME = "campaign://"
 
 MIXED = "xl430_and_xl330"
-"""An arm that is not in any file: one joint is driven by voltage and has no register Goal Current, one by current."""
+"""An arm that is in no file: one joint is voltage-driven, without Goal Current register; the other, current-driven."""
 
 _MIXED_FROM = ("xl430_two_link", "xl330_two_link")
 """The files from which the joints of `MIXED` are taken, in this order."""

@@ -1,4 +1,4 @@
-"""Attacks on the bytes between host and servos by a man in the middle, and attacks on the servos themselves."""
+"""Man-in-the-middle attacks on the bytes between host and servos, and attacks on the servos themselves."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -98,7 +98,7 @@ ON_MOTORS = frozenset({Kind.WEAK, Kind.SATURATED, Kind.PUSHED, Kind.GRIPPED, Kin
 }
 ON_INSTRUCTIONS = frozenset({Kind.DEAF, Kind.DEAF_TO_GOALS, Kind.TWICE_TOLD, Kind.GOAL_FIGHT})
 ON_TIME = frozenset({Kind.RIVAL, Kind.HICCUPS})
-"""Attacks that happen again and again from their start to their end."""
+"""Attacks that recur from their start to their end."""
 
 AT_ONCE = frozenset(set(Kind) - ON_REPLIES - FORGED - ON_INSTRUCTIONS - ON_MOTORS - ON_TIME - {Kind.ECHO})
 """Attacks that happen once, at their start time."""
@@ -188,7 +188,7 @@ def blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
 
 
 def _fast_blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
-    """Do the same for a fast answer, which is never byte-stuffed, up to the first wrong CRC."""
+    """Like `blocks_in`, for a fast answer, which is never byte-stuffed; stop at the first wrong CRC."""
     found: dict[int, tuple[int, bytes]] = {}
     length = 1 + (request.length + 4) * len(request.ids)
     start = data.rfind(HEADER + b"\xfe" + length.to_bytes(2, "little"))  # an answer to another request may be pending

@@ -46,7 +46,7 @@ AFTER_S = 0.5
 """Time for which the arm is observed after the program has ended [s]."""
 
 BALANCE_S = 1.2
-"""The last part of a run, in which an upright arm is balanced before its torque is cut [s]."""
+"""Duration of the last part of a run, in which an upright arm is balanced before its torque is cut [s]."""
 
 Document = dict[str, Any]
 STATE = "XDG_STATE_HOME"
@@ -54,11 +54,11 @@ FREE = frozenset({"Goal Position", "Registered Instruction"})
 """Registers that a servo writes itself, independently of any program."""
 
 _LIMITS_LEFT = frozenset({Kind.KILLED, Kind.LOWERED_LIMIT})
-"""The first start after this pair finds the limit as the other program left it; the second one, as the killed run."""
+"""After this pair, the first start finds the limit as the other program left it; the second, as the killed run did."""
 
 _PACKAGE = "benchmarks.fault_campaign"
 _ARMS = (1, 12)
-"""Numbers of arms on which stops are simulated: the larger one only if the overshoot exceeds that of the first arm."""
+"""Numbers of arms for which stops are simulated; the second is used if the overshoot exceeds the first prediction."""
 
 _CHECKED_CYCLES = 8
 """Cycles per mode in the next start's `hil check`, which only has to restore settings here."""

@@ -12,10 +12,10 @@ PAIRS = 0.35
 """Probability that an injection consists of two faults."""
 
 TOGETHER_S = 0.3
-"""Half of the pairs follow each other within this time [s]."""
+"""In half of the pairs, the two faults are at most this far apart [s]."""
 
 OFTEN = 0.25
-"""Share of the faults that occur in the phase that needs to be tested often."""
+"""Additional share of the faults that are placed in a phase that is short but needs many tests."""
 
 SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"

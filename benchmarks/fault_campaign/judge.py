@@ -1,9 +1,9 @@
-"""Judges a run by the emulated servos' own record, independently of the program's view.
+"""Judges a run from the emulated servos' own record, independently of the program's view.
 
 The judgement is independent of the kind of fault. For every millisecond it determines from the record whether the
 program received correct data, received anything, was obeyed, and kept the arm within its limits and near its
-undisturbed motion. From the first moment at which one of these fails permanently, the current must end within
-`BOUND_MS`.
+undisturbed motion. From the first moment at which one of these conditions fails permanently, the current must end
+within `BOUND_MS`.
 """
 
 import re
@@ -46,7 +46,9 @@ LIE_RAD, LIE_RAD_S, LIE_SHARE = 0.1, 0.5, 0.1
 """Tolerances for the position and velocity reported to the program; the velocity also has a relative tolerance."""
 
 UNSURE_MS = 20
-"""How much earlier than an attack its effect may appear in the record [ms], which is written once the bus is used."""
+"""How much earlier than the attack its effect may appear in the record [ms], because the record is only written when
+the bus is used.
+"""
 
 SHORTEST_WATCHDOG_S = 0.04
 """Shortest practicable timeout of the Bus Watchdog [s]. It counts in steps of 20 ms, and with one step, it would trip
@@ -60,7 +62,7 @@ ASTRAY_RAD, ASTRAY_SHARE = 0.1, 0.35
 """Tolerance for the deviation from the undisturbed motion, absolute and relative to the range of that motion."""
 
 DRIVES_MS = 15
-"""Longest time for which a goal along a visible motion may exceed all goals of the undisturbed run [ms]."""
+"""Longest time for which a goal in the direction of visible motion may exceed all goals of the undisturbed run [ms]."""
 
 DRIVES_SHARE, DRIVES_TICKS, DRIVES_S = 1.2, 5, 0.01
 """Ratio to the largest goal of the undisturbed run above which a goal is too large; smallest change of position that
@@ -329,7 +331,7 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
 
 
 def _not_before(what: str, when: float, helpless: Sequence[tuple[float, float]]) -> float:
-    """When the current had to end [s] for a failure at `when`; for silence, not before something could end it."""
+    """When the current had to end [s] after a failure at `when`; if a servo was silent, once something could end it."""
     until = [end for since, end in helpless if since <= when < end]
     return max([when, *until]) if what.endswith("was not heard") else when
 
@@ -396,7 +398,7 @@ def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int
 
 
 class Told:
-    """The goals that the program sent, and the replies that it received from shortly before the first fault on."""
+    """The goals that the program sent, and the replies that it received from shortly before the first fault onwards."""
 
     def __init__(self, config: Config, traffic: Traffic, start: float) -> None:
         self._joints = config.joints
@@ -502,7 +504,7 @@ def _beyond(config: Config, joint: int, own: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _begins(record: NDArray[Any]) -> int:
-    """The millisecond in which motors drive the arm for the first time."""
+    """The millisecond in which motors first drive the arm."""
     return int(np.argmax(record["driven"].any(axis=1)))
 
 

@@ -35,8 +35,8 @@ LAGS_S = np.linspace(0.0, LAG_S, 7)[1:]
 """Lags of a velocity that are tried [s]."""
 
 LAGGING_S = 0.2
-"""Intervals in each of which the RMS difference of velocities must be ordinary if a lag explains the differences [s]; a
-lag explains them at all times or not at all.
+"""Length of the intervals [s] in each of which a lag must reduce the RMS difference of velocities to an ordinary value:
+a lag explains the differences at all times or not at all.
 """
 
 _TICKS_PER_RAD = 4096 / (2 * np.pi)

@@ -98,7 +98,7 @@ EQUIVALENT = {
         "0.0  ->  1.0",
     ): "status_check: a clock's offset and its time, not used before the first reading",
 }
-"""Mutations that change nothing that these tests could notice, by a part of their line, and why."""
+"""Mutations whose effect these tests cannot detect, each given by part of its line, with the reason."""
 
 _SLOW_IMPORTS = (
     *("numpy", "scipy", "numba", "pydantic", "serial", "hil.estimator.identify"),

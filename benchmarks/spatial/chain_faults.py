@@ -4,8 +4,8 @@
 
 The faults are those of benchmarks/faults.py, injected while the complete command runs on the fake arms
 `fake_open_manipulator_x` and `fake_viperx_300`, with paths of a few seconds. A spatial arm falls when torque is cut, so
-the rule "current must end within 100 ms" applies only if the servos can no longer be commanded. Runs are judged by the
-emulated servos' own record, which the program never sees:
+the rule "current must end within 100 ms" applies only if the servos can no longer be commanded. Runs are judged from
+the emulated servos' own record, which the program never sees:
 
 can command     the faults are of kinds that leave commands and readings intact (`COMMANDABLE`), the record shows no
                 servo that was silent, disobeyed or reported something false, and nothing held the arm by force
@@ -93,7 +93,7 @@ WEAKER = 0.3
 """Force that a motor can overcome in any pose on the path home, relative to the largest motor torque of the run."""
 
 SETTLES_S = 1.0
-"""Time beyond the predicted lowering that a stop may take [s]."""
+"""Time that a stop may take beyond the predicted duration of lowering [s]."""
 
 LIES_RAD = 0.1
 LOOKED_AT_MS = 5

@@ -1,11 +1,12 @@
-"""Random spatial arms with three to six joints, identified on the fake bus from a description that is 30 % off.
+"""Random spatial arms with three to six joints, identified on the fake bus from a description with masses 30 % off.
 
     python benchmarks/spatial/chain_population.py --arms 60 [--first 0] [--plain] [--json]
 
 Axes, lengths, masses, servos, rest pose and limits are drawn at random; the real arm's masses differ from the URDF's by
 30 %, its centres of mass by 5 mm, its torque constants by 3 %. Unless `--plain` is given, the files also vary in style
-like those of other authors: axes in any direction, turned joint frames, meshes and boxes as collision geometry, fixed
-tool frames, a gripper with two prismatic fingers, one mimicking the other, a tilted base, and `friction = "auto"`.
+as those of different authors do: axes in any direction, turned joint frames, meshes and boxes as collision geometry,
+fixed tool frames, a gripper with two prismatic fingers, one mimicking the other, a tilted base, and `friction =
+"auto"`.
 
 The script counts runs that finish with a result, collisions of the recorded motion with the arm itself or the floor,
 exceeded position limits, and results that say "yes" although they are wrong: the rigid-body torque on random motions is

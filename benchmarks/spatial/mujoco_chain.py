@@ -4,7 +4,7 @@ The arm is a MuJoCo model with the described geometry and masses. The unknowns a
 parameters of a Cholesky factor relative to the description's), and armature, damping, friction loss and a constant
 torque of every joint. Their number is about that of hil's stage 2. The arm would fall in an open-loop simulation, so
 the software spring and damper are part of the model, as an affine bias. The method gets every advantage: the true lag,
-an initial state from the Fourier series of the period, an initial guess as good as hil's, its own optimiser with
+an initial state from the Fourier series of the period, an initial guess as close as hil's, its own optimiser with
 rollouts on all cores, and two integration steps per sample.
 """
 

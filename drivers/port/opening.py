@@ -91,8 +91,8 @@ def _advice(error: BaseException, url: str) -> str:
         )
     if "No such file" in text and "://" in url:
         return (
-            "The file in this URL does not exist. A relative path starts at the configuration's folder or, outside a "
-            "configuration, at the working directory."
+            "The file in this URL does not exist. A relative path is resolved from the configuration's folder or, "
+            "outside a configuration, from the working directory."
         )
     if "No such file" in text:
         return "Is the adapter plugged in? `hil scan` lists the ports that exist."

@@ -120,7 +120,7 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
 
     Goals are restored as far as the servo's limits allow (`attainable`), and only if torque is still off and the mode
     and limits are those to which the goals belong: in current mode, the former goal of a position-controlled servo is
-    full torque. The Bus Watchdog is cleared no earlier, since it may be all that stops the motor. Each register is read
+    full torque. The Bus Watchdog is cleared only then, since it may be all that stops the motor. Each register is read
     back.
 
     Raises WrongSetting if torque is on, and TorqueDoubted if EEPROM is locked although torque reads back as off. Raises

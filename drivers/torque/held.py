@@ -61,8 +61,8 @@ def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
     the goals that limited their output.
 
     With zero PWM and torque on, the motor's terminals are shorted, so it brakes. Raises the errors of `Servo.write`;
-    whatever ends the sinking early gets a note on the goals that are left lowered, since restoring them with torque on
-    would jerk the arm back up.
+    an exception that ends the sinking early gets a note on the goals that are left lowered, since restoring them with
+    torque on would jerk the arm back up.
     """
     held = [servo for servo in servos.values() if is_held(servo)]
     names = [_what_drives(servo) for servo in held]

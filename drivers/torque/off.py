@@ -46,12 +46,12 @@ class TorqueOff:
 
     confirmed: joints whose servos were read back as off.
     unconfirmed: the other joints, each with the reason.
-    unwatched: joints of either group whose servos have no Bus Watchdog.
+    unwatched: confirmed or unconfirmed joints whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
-    rebooted: confirmed joints whose servos were reset, and so lost the watchdog armed before torque was switched on.
-    disarmed: confirmed joints whose servos lost only this watchdog, which another program switched off.
+    rebooted: confirmed joints whose servos were reset, which disarmed the watchdog armed before torque was switched on.
+    disarmed: confirmed joints whose servos were not reset, but whose watchdog another program switched off.
     tripped: joints whose Bus Watchdog may have tripped, which zeroes their goals; it has been cleared since.
-    driven: joints in neither group, because another program switches their servos' torque on whenever it is cut.
+    driven: the remaining joints, because another program switches their servos' torque on whenever it is cut.
     """
 
     confirmed: tuple[Joint, ...]
@@ -130,7 +130,7 @@ class TorqueOff:
             return self._outcome_alone()
         told = [
             f"TORQUE IS ON AT {and_list(str(joint).upper() for joint in self.driven)}: ANOTHER PROGRAM TURNS IT BACK "
-            "ON EVERY TIME IT IS CUT. CUT THE SUPPLY NOW, then end that program."
+            "ON EVERY TIME IT IS CUT. CUT THE POWER NOW, then end that program."
         ]
         if self.unconfirmed:
             told.append(self._outcome_alone())
@@ -360,7 +360,7 @@ def _text(error: Exception) -> str:
 
 @contextmanager
 def signals_held_back() -> Iterator[None]:
-    """Hold back SIGINT, SIGTERM and SIGHUP in the block; each kind that arrived is raised once afterwards.
+    """Hold back SIGINT, SIGTERM and SIGHUP in the `with` block; each kind that arrived is raised once afterwards.
 
     Only the main thread receives signals; in any other thread this does nothing.
     """

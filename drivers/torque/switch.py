@@ -92,7 +92,7 @@ class TorqueSwitch:
 
     @contextmanager
     def torque(self, watchdog: float) -> Iterator[None]:
-        """Switch torque on for the block and off afterwards, however the block exits.
+        """Switch torque on for the `with` block and off afterwards, however the block exits.
 
         watchdog: time without packets after which a servo stops by itself [s] (in steps of 20 ms, at most 2.54 s).
         Raises BusShared if another program has switched torque on; TorqueNotOff on exit if torque off could not be

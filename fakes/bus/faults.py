@@ -60,7 +60,7 @@ class FaultKind(StrEnum):
 class FaultFacts(NamedTuple):
     """The effect of one kind of fault, and the meaning, default and range (inclusive) of its `amount`.
 
-    amount: its unit; "" if the kind has no amount. whole: whether it must be a whole number.
+    amount: what the amount is, with its unit; "" if the kind has none. whole: whether it must be a whole number.
     """
 
     does: str

@@ -31,7 +31,7 @@ _PULL_S = 0.01
 
 
 _FASTEST_RAD_S = 200.0
-"""Greatest mean velocity of a movement [rad/s]; simulated gears and stops do not survive much more."""
+"""Greatest mean velocity of a movement [rad/s]; much more would break the simulated gears and hard stops."""
 
 _MOST_TICKS = 1 << 20
 """Largest Present Position of a servo in either direction: 256 turns."""
@@ -56,7 +56,7 @@ class Move(Described):
             gt=0,
             le=600,
             allow_inf_nan=False,
-            description="duration of the movement [s]; longer above 200 rad/s on average",
+            description="duration of the movement [s]; extended if the mean velocity would exceed 200 rad/s",
         ),
     ] = 1.0
     hold: Annotated[float, Field(ge=0, description="how long the joint is held afterwards [s]")] = math.inf

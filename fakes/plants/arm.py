@@ -145,7 +145,7 @@ class Arm(Described):
             )
         for joint, (angle, drive) in enumerate(zip(self.start, self.drives, strict=True), start=1):
             if drive.stops is not None and not drive.stops[0] <= angle <= drive.stops[1]:
-                raise ValueError(f"start: {angle:g} rad for joint {joint} is beyond its stops {list(drive.stops)}")
+                raise ValueError(f"start: {angle:g} rad for joint {joint} is beyond its hard stops {list(drive.stops)}")
         return self
 
     @property
@@ -160,8 +160,8 @@ def base_parameters(arm: Arm | None, time: float = math.inf) -> dict[str, float]
     Empty if `arm` is None, since the parameters of other plants are unknown. By default, the drives are warm.
 
     Effects that no base parameter represents are left out: dry friction beyond Coulomb friction (Stribeck rise, load),
-    presliding, the current loop's lag, saturation, ripple, cogging, a cable's stiffness, backlash, stops. The `gravity`
-    values are those of the tilted plane; an offset includes a cable's torque at angle 0.
+    presliding, the current loop's lag, saturation, ripple, cogging, a cable's stiffness, backlash, hard stops. The
+    `gravity` values are those of the tilted plane; an offset includes a cable's torque at angle 0.
     """
     if arm is None:
         return {}

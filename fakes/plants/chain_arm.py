@@ -59,13 +59,13 @@ class ChainArm(Described):
             if told:
                 raise ValueError(f"drives: {told[0]} of {name} is only supported by planar fake arms; leave it out")
             if drive.stops is not None and not drive.stops[0] <= angle <= drive.stops[1]:
-                raise ValueError(f"start: {angle:g} rad for joint {name} is beyond its stops {list(drive.stops)}")
+                raise ValueError(f"start: {angle:g} rad for joint {name} is beyond its hard stops {list(drive.stops)}")
         for joint, body in zip(self.description.joints, self.bodies, strict=True):
             least = np.linalg.eigvalsh(body.inertia)[0]
             if least < -1e-12:
                 raise ValueError(
                     f'{self.urdf}: the fake arm cannot be simulated, because the inertia of link "{joint.link}" has a '
-                    f"negative principal moment ({least:.2g} kg m^2): correct its ixx to izz"
+                    f"negative principal moment ({least:.2g} kg m^2): correct its inertia (ixx to izz)"
                 )
         return self
 

@@ -1,5 +1,5 @@
-"""The drive of one joint during a time step: current lag, torque, friction, stops. This code runs in every step, so it
-uses plain floats.
+"""The drive of one joint during a time step: current lag, torque, friction, hard stops. This code runs in every step,
+so it uses plain floats.
 
 Presliding friction follows Canudas de Wit, Olsson, Astrom and Lischinsky (IEEE Transactions on Automatic Control 40
 (1995) 419): bristles deflect with the joint and slip,
@@ -167,7 +167,7 @@ class Motor:
     def _shape(
         self, step: float, torque: float, level: float, angle: float, velocity: float
     ) -> tuple[float, float, float]:
-        """Apply what only some drives have: saturation, ripple, cogging, load-dependent friction, cables and stops."""
+        """Apply the optional effects: saturation, ripple, cogging, load-dependent friction, cables and hard stops."""
         drive = self._drive
         slope = 0.0
         if self._bent:

@@ -8,7 +8,7 @@ Goal Update), which is on the page of the XL430-W250 but missing from older revi
 the XH430-W210 is that of the XD430-T210, although the oldest page of the XH430-W210 itself states 360.
 
 Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
-tens of percent, which is enough to make a position move look right.
+tens of percent, which is enough for position moves to look realistic.
 """
 
 import math

@@ -141,7 +141,7 @@ class EmulatedServo(Powered):
     def power_up(self, now: float, angle: Callable[[], float], boot_s: float = 0.0) -> None:
         """Power up at time `now` [s]; the servo does not respond for `boot_s` [s].
 
-        angle: returns the joint's current position [rad]; it is also called later.
+        angle: function that returns the joint's present position [rad]; it is kept and called again later.
         RAM registers take their initial values, or those of the backup if Startup Configuration selects it; the XL320's
         Torque Limit is set to Max Torque. Torque is off, and errors are cleared. The turn count is lost: Present
         Position starts within one turn (before Homing Offset).

@@ -13,7 +13,9 @@ from hil.results.display import html_table
 from hil.setup.preflight import Finding, Level, check_arm
 
 _ALWAYS_HELD_HZ = 150.0
-"""Rate [Hz] from which the delay of a stabiliser is no longer checked, because loading the pilot takes a second."""
+"""Rate [Hz] from which the stabiliser's delay does not matter; it is then not checked, since loading the pilot for this
+takes a second.
+"""
 
 __all__ = ["CheckReport", "Finding", "Level", "check"]
 

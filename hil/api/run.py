@@ -83,7 +83,7 @@ class Identification(SettledResult):
 
         Raises:
             ExportError: the format cannot hold this arm, or a package for it is not installed.
-            ResultError: the run folder holds another estimate by now.
+            ResultError: the run has been estimated again since this result was obtained.
         """
         from hil.export.formats import FORMATS, export
         from hil.model_file import read_result
@@ -93,7 +93,7 @@ class Identification(SettledResult):
         if kind in FORMATS and dict(read_result(self.run).quantities) != dict(self.quantities):
             raise ResultError(
                 f"{self.run} has been estimated again since this result was obtained, so the file would contain other "
-                f"values. To export the present ones: hil.load_run({str(self.run)!r}).result.export({kind!r})."
+                f"values. To export the new ones: hil.load_run({str(self.run)!r}).result.export({kind!r})."
             )
         return export(self.run, kind, None if out is None else Path(out), link_length)
 

@@ -7,7 +7,7 @@ from hil.estimator.chain.model.tilt import MEANINGS
 from hil.estimator.models.terms import kind_of, term_of
 
 _SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torque_scale")
-"""Terms that need no sentence: every robot description can represent them, or `torque_constants` reports them."""
+"""Terms that need no sentence, because every robot description has them or because `torque_constants` reports them."""
 
 
 def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:

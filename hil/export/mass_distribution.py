@@ -10,7 +10,7 @@ distribution is chosen among all dynamically equivalent ones (m mass, c centre, 
 
 As in a uniform rod held at its end, m c^2 is 3/4 of each second moment, or more if a rod would be too heavy for
 inertia_1. The centre of link 1 is kept within its length. This is possible if and only if inertia_1 inertia_2 >
-coupling^2, which all bodies of positive mass obey.
+coupling^2, which all bodies of positive mass satisfy.
 """
 
 import math

@@ -2,8 +2,8 @@
 
 The parameters are drawn from a normal distribution with the estimated covariance. One factor common to all torques
 is also drawn, because the torque constant is known far less accurately than anything else. The motion reveals the
-ratios of the joints' constants, so a single factor remains, as uncertain as the best-known joint's constant. The torque
-per goal (in A or V) is scaled with it, so that all drawn arms respond equally to the same goals.
+ratios of the joints' constants, so only a common factor remains; its uncertainty is that of the best-known joint's
+constant. The torque per goal (in A or V) is scaled with it, so that all drawn arms respond equally to the same goals.
 """
 
 from collections.abc import Sequence

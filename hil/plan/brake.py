@@ -1,6 +1,6 @@
 """The first part of a stop, if possible: braking with currents that oppose the joints' velocities.
 
-Braking lasts for a bounded time and stays within the current limits. It ends at once when a reply or deadline is
+Braking is limited in time and stays within the current limits. It ends at once when a reply or deadline is
 missed, a servo raises an alert, a second signal arrives, or a joint speeds up, as it does if its motor turns the wrong
 way.
 
@@ -24,7 +24,7 @@ A stronger brake stops the arm hardly any sooner, and throws it back farther if 
 LIGHTEST = 0.5
 """Smallest inertia that a joint is assumed to have, relative to the typical rotor inertia of its servo.
 
-A light joint that is braked too hard is thrown back faster than it came before its velocity can be read again.
+A light joint that is braked too hard would be moving backwards, faster than before, when its velocity is next read.
 """
 
 DELAY_S = 0.002
@@ -37,8 +37,8 @@ Some increase is normal: gravity and the other joint's brake act on the joint.
 """
 
 STILL_FASTER, SLOWS_AFTER_S = 0.06, 0.02
-"""The corresponding fraction once braking has lasted for the given time [s]. Otherwise, a reversed motor could drive a
-joint with a high velocity limit until braking ends.
+"""Once it has lasted for the given time [s], braking is abandoned if the speed increases by this smaller fraction of
+the velocity limit. Otherwise, a reversed motor could drive a joint with a high velocity limit until braking ends.
 """
 
 NOTICED_AFTER = 2
@@ -53,8 +53,8 @@ def may_brake(config: Config, error: BaseException) -> bool:
 
 
 def braking_gains(config: Config, interval: float | None = None) -> list[float]:
-    """Braking gains [A s/rad, or V s/rad in PWM mode] with which no single goal reverses the motion of the lightest
-    joint.
+    """Braking gains [A s/rad, or V s/rad in PWM mode], low enough that no single goal reverses the motion of even the
+    lightest joint.
 
     interval: time between two exchanges [s]; by default, the interval on a fast bus.
     """

@@ -25,7 +25,7 @@ from hil.plan.chain_model import ChainTorque, KnownChain, described_torque, know
 from hil.plan.plan import Plan, Segment, make_plan, plan_with
 
 SETTLE_IN = 0.3  # s over which the feed-forward is faded in and out
-TORQUE_SHARE = 0.8  # of a joint's torque limit that a path may use: the rest is for errors of the assumed model
+TORQUE_SHARE = 0.8  # fraction of a joint's torque limit that a path may use; the rest allows for model errors
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class PathSegment(Segment):
 
 
 class NoHeadroom(ConfigError):
-    """A path needs nearly all of a joint's torque."""
+    """A path requires too large a share of a joint's torque limit."""
 
 
 def plan_of(config: Config) -> Plan:
@@ -84,7 +84,7 @@ def make_chain_plan(config: Config) -> Plan:
 
 
 def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str, int], Path]) -> Plan:
-    """Plan the paths that `path` returns for each role and seed, with the assumed model `thought`. Raises ConfigError
+    """Plan the paths that `path` returns for each role and seed, using the assumed model `thought`. Raises ConfigError
     if a path needs too much torque.
     """
 
@@ -96,7 +96,7 @@ def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str,
 
 
 def lowering_samples(config: Config) -> int:
-    """Largest number of samples in a stop that lowers the arm, including braking and coming to rest."""
+    """Maximum number of samples in a stop that lowers the arm, including braking and coming to rest."""
     safety = config.safety
     return round((safety.lower_time + 1.0 + 2.0 * SETTLE_IN) * config.experiment.rate)
 

@@ -1,10 +1,10 @@
-"""How to find a safe peak torque, as text for messages."""
+"""Advice on finding a safe peak torque, for messages."""
 
 from hil.config.schema import Config
 
 
 def how_to_find_torque(config: Config) -> str:
-    """How to find a safe value of experiment.peak_torque for this arm."""
+    """Advice on finding a safe value of experiment.peak_torque for this arm."""
     if config.is_chain or config.arm.link_lengths is not None:
         return "`hil dry-run` finds a safe value."
     return (

@@ -34,8 +34,8 @@ MOST_TURNED = 3.0
 """Ratio of drops, as in `TURNED`, above which the unexplained torque did not come from the joint's motor alone."""
 
 UNEVEN = 0.3
-"""Largest deviation from a proportional drop, relative to the total drop: if the unexplained torque deviates more from
-a drop in proportion to the joint's own torque, it has another cause.
+"""Largest deviation of the unexplained torque from a drop in proportion to the joint's own torque, relative to the
+total drop; a larger deviation shows that it has another cause.
 """
 
 MOST_UNEVEN = 3
@@ -114,7 +114,7 @@ class Obedience:
     def question(self, joint: int, now: float) -> bool:
         """Begin a test of a joint that speeds up although its torque opposes the motion. now: time [s].
 
-        Returns False if a test has just been inconclusive, in which case the motor is to blame.
+        Returns False if a test has just been inconclusive, in which case the motor counts as reversed.
         """
         if now < self._doubted_until[joint]:
             return False
@@ -123,7 +123,7 @@ class Obedience:
         return True
 
     def suspect(self, found: Residual, velocity: Sequence[float], now: float) -> None:
-        """Begin the tests that the latest exchange calls for. velocity: trusted velocities [rad/s]. now: time of that
+        """Begin the tests that the latest exchange requires. velocity: trusted velocities [rad/s]. now: time of that
         exchange [s].
         """
         for joint, (lacking, torque) in enumerate(zip(found.lacking, found.torque, strict=True)):
@@ -139,7 +139,7 @@ class Obedience:
             if test is None:
                 continue
             lacking, torque = found.lacking[joint], found.torque[joint]
-            if test.lacking is None:  # the goal was taken away with this exchange
+            if test.lacking is None:  # this exchange removed the goal
                 test.lacking, test.torque = lacking, torque
                 test.drives |= _drives(lacking, velocity[joint])
             elif abs(torque) <= ENOUGH * abs(test.torque) or now - test.since > LONGEST_TEST_S:

@@ -70,7 +70,7 @@ class Plan:
     rest_samples: int
     end_samples: int
     brake_samples: int
-    """Largest number of exchanges during which a stop brakes."""
+    """Maximum number of exchanges for which a stop brakes the joints."""
     max_settling_periods: int
     periods: int
     settle_within: float
@@ -78,14 +78,14 @@ class Plan:
     warm_up_periods: int = 0
     """Number of warm-up periods of the first multisine, played before those that may be used."""
     lower_samples: int = 0
-    """Largest number of samples for lowering a spatial arm after a stop."""
+    """Maximum number of samples for lowering a spatial arm after a stop."""
 
     def first_segment(self) -> "Plan":
         return replace(self, segments=self.segments[:1])
 
     @property
     def capacity(self) -> int:
-        """Largest number of samples that carrying out the plan may take."""
+        """Maximum number of samples that carrying out the plan may take."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
         still = self.rest_samples + 3 * self.end_samples
@@ -103,7 +103,7 @@ class Plan:
 
 
 def scaled(config: Config, plan: Plan, peak_torque: Array) -> Plan:
-    """The same waves scaled to other peak torques (joints,) [N m]."""
+    """The same plan with its multisines scaled to other peak torques (joints,) [N m]."""
     return replace(plan, segments=tuple(_scaled_segment(config, segment, peak_torque) for segment in plan.segments))
 
 
@@ -153,7 +153,7 @@ def rest_window(rate: float) -> int:
 
 
 def _end_samples(config: Config) -> int:
-    """Largest number of samples to wait until the arm is at rest: a multiple of the window."""
+    """Maximum number of samples to wait until the arm is at rest: a multiple of the window."""
     rate = config.experiment.rate
     window = rest_window(rate)
     return window * max(1, math.ceil(config.safety.rest_time * rate / window))

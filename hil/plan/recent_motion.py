@@ -1,8 +1,8 @@
 """Range of velocities that each joint's change of position allows: no brake may rely on a reported velocity alone.
 
-A brake that trusted a false velocity would drive the joint. Therefore the velocity to brake against is the reported
-one, confined to the range that the change of position allows over two spans of time: a short one, which soon shows a
-reversal, and a long one, in which a slow motion is visible despite the encoder's steps. Each range includes zero, but
+A brake that trusted a false velocity would drive the joint. The brake therefore opposes the reported velocity only
+once it is limited to the range that the change of position allows over two spans of time: a short one, which soon shows
+a reversal, and a long one, in which a slow motion is visible despite the encoder's steps. Each range includes zero, but
 excludes the direction opposite to a visible motion.
 """
 
@@ -88,7 +88,7 @@ class RecentMotion:
         return [self._confined(joint, velocity) for joint, velocity in enumerate(state.velocity)]
 
     def speeds(self) -> list[float]:
-        """Speed at which each joint has visibly moved over the longer span [rad/s]; 0 if unknown."""
+        """Speed of each joint over the longer span, derived from its change of position [rad/s]; 0 if unknown."""
         found = []
         for joint, step in enumerate(self._steps):
             travels = self.travels(joint)
@@ -96,8 +96,8 @@ class RecentMotion:
         return found
 
     def contradicts(self, joint: int, velocity: float) -> bool:
-        """Whether a velocity is impossible for the joint: no known change of its position allows it or, if no change is
-        known, no servo of this model turns that fast.
+        """Whether a velocity is impossible for the joint: every known change of its position rules it out or, if no
+        change is known, no servo of this model turns that fast.
         """
         travels = self.travels(joint)
         if not travels:
@@ -132,7 +132,7 @@ class RecentMotion:
         return abs(velocity) > self._fastest[joint]
 
     def travels(self, joint: int) -> list[Travel]:
-        """The changes of a joint's position over the short and the long span; none if the joint has been seen only
+        """The changes of a joint's position over the short and the long span; none if the joint has replied only
         once.
         """
         states = [state for state in self._states if not isnan(state.position[joint])]

@@ -8,7 +8,7 @@ WATCHDOG_SHARE = 0.8
 """Upper bound on both limits, relative to the watchdog timeout."""
 
 _FEWEST_MISSING = 2
-"""Smallest number of missing replies that counts as a fault: a single lost packet does not, however low the rate."""
+"""Minimum number of missing replies that counts as a fault: however low the rate, one lost packet is not enough."""
 
 _ROUNDING_S = 1e-6
 
@@ -19,9 +19,9 @@ switching it off takes some time.
 """
 
 BRIDGED_ALONE_S = 0.028
-"""How long servos may fail to reply while an arm is being lowered and another servo replies [s]. The silent servo may
-have changed its ID: then only its Bus Watchdog can stop it, and that counts from the last packet on the bus, whichever
-servo the packet was for.
+"""How long servos may fail to reply while an arm is being lowered and another servo replies [s]. The silent servo's ID
+may have changed: then only its Bus Watchdog can stop it, and its timeout starts anew with every packet on the bus,
+whichever servo the packet is for.
 """
 
 

@@ -66,7 +66,7 @@ class Stabiliser:
         return all(abs(position - pose) <= BALANCED_RAD for position, pose in away)
 
     def add(self, goal: list[float], former: State | None) -> list[float]:
-        """Goal currents [A] with the stabiliser's contribution added. former: the sample before this command."""
+        """Goal currents [A] with the stabiliser's contribution added. former: the latest sample before this command."""
         if former is None:
             return goal
         added, integral = self._added, self._integral
@@ -84,7 +84,7 @@ class Stabiliser:
 def too_slow(config: Config) -> str:
     """Explain why the rate is too low for the stabiliser, and what to do; "" if it is high enough.
 
-    A spring whose torque is late by `delay` drives the motion like a negative damper of stiffness times `delay`. The
+    A spring whose torque is delayed by `delay` acts like negative damping of magnitude stiffness times `delay`. The
     joint oscillates unless the configured damping and the servo's typical viscous friction together outweigh it.
     """
     if config.stabiliser is None:

@@ -17,8 +17,8 @@ STATIONS = 16
 """Number of poses of the planned transition at which an arm may join it."""
 
 PULL_PER_S, PULL_SHARE = 2.0, 0.25
-"""Growth rate of the additional torque towards the path, relative to the spring's torque [1/s], and largest additional
-torque, relative to the joint's largest torque.
+"""Growth rate of the additional torque that pulls a joint to the path, relative to the spring's torque [1/s], and its
+upper limit, relative to the joint's largest torque.
 
 At a low sampling rate the spring alone is too weak to overcome the friction of a light joint.
 """

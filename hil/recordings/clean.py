@@ -11,8 +11,8 @@ from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import LONGEST_GAP, MOST_GAP
 from hil.recordings.encoder import encoder_step
 
-FEW = 0.02  # of the rows: share that may be corrected, if reported
-LONGEST_HOLE = 0.05  # s of torque that are filled in
+FEW = 0.02  # largest share of the rows that may be corrected; the correction is reported
+LONGEST_HOLE = 0.05  # s: longest gap in the torque that is filled in
 RESTART = 0.2  # s: a larger backward step in time starts a new recording
 
 

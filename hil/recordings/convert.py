@@ -24,7 +24,7 @@ from hil.recordings.velocity import notes as velocity_notes
 
 Values = NDArray[np.float64]
 
-SMALLEST_STEP = 1e-9  # rad, where readings show no steps: their noise is measured
+SMALLEST_STEP = 1e-9  # rad, for readings without visible steps, whose noise is measured instead
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def convert(table: Table, columns: Columns) -> Converted:
     position = np.stack(
         [_quantity(table, name, "position", whole.position_unit, ticks, notes) for name in whole.position]
     )
-    if columns.position_unit is None:  # that of `whole` may be guessed
+    if columns.position_unit is None:  # the unit in `whole` may be a guess
         stated = [table.find(name)[2] is not None for name in whole.position]
         refuse_degrees(table.source, whole.position, time, position, stated)
     found = rates(table, time, position)

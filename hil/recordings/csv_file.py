@@ -15,7 +15,8 @@ from hil.runs.file_size import MOST_CSV_BYTES
 _REMARKS = ("#", "%", "//")
 
 _LARGEST = 1e30
-"""Largest absolute value that is read as a number. Time stamps in nanoseconds, the largest in use, are about 1e18."""
+"""Largest absolute value that is read as a number; the largest in practice are time stamps in nanoseconds (about 1e18).
+"""
 
 
 def read_csv_table(path: Path) -> Table:
@@ -125,7 +126,7 @@ def _is_number(field: str) -> bool:
 
 
 def _are_units(fields: list[str]) -> bool:
-    """Whether a line states units: at least one is known, and none of the others is a number."""
+    """Whether a line states units: at least one of its fields is a known unit, and none is a number."""
     texts = [field.strip(" []()") for field in fields]
     known = any(unit_of(text) is not None and not text.isdigit() for text in texts)
     return known and not any(text and np.isfinite(_number(text, decimal_comma=True)) for text in texts)

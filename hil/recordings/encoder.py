@@ -5,8 +5,8 @@ import numpy as np
 from hil.estimator.arrays import Array
 
 FEWEST = 5  # readings
-MOST_OFF = 0.12  # of a step: largest distance of a reading from a whole step, for values rounded in the file
-MOST_SHARE = 0.7  # of the readings: with a larger share of distinct values, no steps are recognised
+MOST_OFF = 0.12  # largest distance from a reading to a whole step, in steps, to allow for values rounded in the file
+MOST_SHARE = 0.7  # largest ratio of distinct values to readings at which steps are recognised
 
 
 def encoder_step(position: Array) -> float | None:

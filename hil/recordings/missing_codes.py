@@ -11,7 +11,7 @@ CODES = tuple(
 
 FEWEST = 2
 APART = 2.0
-"""Smallest distance of a code from all other values, relative to their range."""
+"""Minimum distance between a code and all other values, relative to the range of the latter."""
 
 
 def without_codes(values: Array) -> tuple[Array, float | None]:

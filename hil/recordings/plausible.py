@@ -1,4 +1,4 @@
-"""Rejection of angles, torques, currents and voltages that no servo arm reaches, usually because no unit is stated.
+"""Rejection of angles, torques, currents and voltages that no servo arm reaches, which usually lack a stated unit.
 
 Joints that rotate continuously are accepted, and so is everything if [columns] states the unit. A torque, current or
 voltage is also accepted if its column states the unit.
@@ -31,7 +31,7 @@ _ONE_WAY = 0.7
 """A joint counts as rotating continuously if at least this fraction of its path is in one direction."""
 
 _MOST_DEGREES = 720.0
-"""Largest angle of most joints in degrees; register values of servos are usually larger."""
+"""Angle in degrees that most joints never exceed; register values of servos are usually larger."""
 
 _OVER_S, _USUAL = 0.02, 0.9
 """Time over which speeds are averaged to suppress noise [s], and the quantile of the speeds that is checked."""

@@ -18,7 +18,7 @@ from hil.recordings.units import split_head
 WINDOW = 0.5  # s over which motion is averaged, so that noise and filters of the velocity hardly matter
 FEWEST_WINDOWS = 8
 LONGEST_LAG = 0.3  # s
-LONGEST_GAP = 0.25  # s between rows: a longer one is left out, with all windows that touch it
+LONGEST_GAP = 0.25  # s between rows: longer gaps are left out, with all windows that overlap them
 ALIKE = 0.99  # correlation of the two motions below which a column is not the velocity of that joint
 APART = 0.04  # relative difference that is worth a warning
 FAR_APART = 0.2  # logarithm of the factor beyond which the result is unusable: inertias are off by 50 %
@@ -80,13 +80,13 @@ def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
 
 
 def _factors(found: Sequence[Rate]) -> list[float]:
-    """The factors of all columns relative to the known unit that suits them best."""
+    """The factors of all columns, relative to the known unit of velocity that fits them best."""
     unit = min(KNOWN_UNITS, key=lambda each: max((abs(math.log(rate.factor / each)) for rate in found), default=0.0))
     return [rate.factor / unit for rate in found]
 
 
 def notes(found: Sequence[Rate]) -> tuple[str, ...]:
-    """Sentences about velocities that are not simultaneous with the positions."""
+    """Sentences about velocities that lead or lag the positions."""
     return tuple(
         f"Column {rate.column!r} is {1e3 * abs(rate.late):.2g} ms {'behind' if rate.late > 0.0 else 'ahead of'} the "
         "position; velocities are not used."
@@ -124,13 +124,13 @@ def _rate(column: str, time: Array, position: Array, velocity: Array) -> Rate | 
     best = int(np.argmax(np.abs(alike)))
     if not abs(alike[best]) > ALIKE:
         return None
-    # Noise on either side would bias a regression on it; the ratio of the sizes is in between.
+    # Noise in the regressor would bias a regression in either direction; the ratio of the amplitudes lies in between.
     factor = float(np.std(each[best]) / np.std(moved))
     return Rate(column, factor, float(lags[best])) if alike[best] > 0.0 else None
 
 
 def _in_order(time: Array, *values: Array) -> tuple[Array, ...]:
-    """Return the rows without missing values, in the order of their times, each time once."""
+    """Return the rows without missing values, sorted by time; of rows with the same time, only the first is kept."""
     known = np.flatnonzero(np.all(np.isfinite((time, *values)), axis=0))
     known = known[np.argsort(time[known], kind="stable")]
     known = known[np.concatenate(([True], np.diff(time[known]) > 0.0))[: known.size]]

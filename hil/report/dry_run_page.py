@@ -1,4 +1,4 @@
-"""The page of a dry run, a single file: verdict, predicted peaks and an animation of one simulated arm."""
+"""The dry-run page, a single HTML file with the verdict, the predicted peaks and an animation of one simulated arm."""
 
 from datetime import datetime
 from pathlib import Path
@@ -31,7 +31,7 @@ def write_dry_run_page(config: Config, found: DryRun | ChainDryRun, path: Path) 
 
 
 def _in_space(found: ChainDryRun) -> SpatialMotion | None:
-    """The simulated arm with the least clearance."""
+    """Animation of the simulated arm with the least clearance; None if no motion was kept."""
     motions = found.prediction.shown
     if not len(motions):
         return None

@@ -12,7 +12,7 @@ FAINT = 0.1
 
 
 def draw_matrix(matrix: Matrix, width: float, font: str) -> str:
-    """Draw one `<svg>` element of this `width` [px]."""
+    """Draw the matrix as an `<svg>` element of the given `width` [px]."""
     count = len(matrix.labels)
     letters = max(map(len, matrix.labels))
     size = 12.0 if width > 500 else 8.5

@@ -32,7 +32,7 @@ class _Shown:
 
 
 def write_recording_report(folder: Path, out: Path | None = None) -> Path:
-    """Write the report on a recording folder, by default into that folder, and return the path of the report.
+    """Write the report on a recording folder, by default in that folder, and return the report's path.
 
     Raises RunFolderError, ResultError.
     """
@@ -71,7 +71,7 @@ def _verdict(shown: _Shown) -> Section:
 
 
 def _prediction(shown: _Shown) -> Section | None:
-    """The longest recording: position and residual; None if nothing was simulated."""
+    """The section on the longest recording; None if nothing was simulated."""
     longest = max(shown.recordings, key=lambda each: each.time.size)
     if not np.isfinite(longest.predicted).any():
         return None

@@ -38,8 +38,8 @@ def spatial_motion(
 ) -> SpatialMotion:
     """The motion (joints, samples) [rad] of a configured spatial arm.
 
-    ways: number of samples at the beginning and at the end that lead from and to the rest pose, where distances less
-    than the margin are allowed. Raises ConfigError, ArmFileError.
+    ways: numbers of samples at the beginning and at the end in which the arm moves from and to the rest pose; there,
+    distances below the margin are allowed. Raises ConfigError, ArmFileError.
     """
     space = Space.of(config)
     step = _frame_step(position)
@@ -70,7 +70,7 @@ def _frame_step(position: Array) -> int:
 
 
 def _clearances(space: Space, angles: Array, on_the_way: Mask) -> dict[str, Any]:
-    """Smallest clearance of each frame [mm], excess over the required one [mm], and index of the pair in `pairs`."""
+    """For each frame: least clearance [mm], least excess over the required clearance [mm], and index of the pair."""
     pairs: dict[tuple[str, str], int] = {}
     clearance, room, nearest = [], [], []
     for frame, way in enumerate(on_the_way.tolist()):
@@ -109,6 +109,6 @@ def _corners(space: Space) -> Array:
 
 
 def _rounded(*arrays: Array) -> list[float]:
-    """All numbers in one list, to a hundredth of a millimetre."""
+    """All numbers in one list, rounded to a hundredth of a millimetre."""
     flat = np.concatenate([np.asarray(each, dtype=np.float64).reshape(-1) for each in arrays])
     return [float(value) for value in np.round(flat, 5)]

@@ -41,8 +41,8 @@ class Folded:
 class Motion:
     """An animated planar arm. interval: time between frames [s]. angles: each joint's angles, frame by frame [rad].
 
-    lengths: link lengths in any unit. hangs: whether gravity acts in the plane, downwards. caption: text below the
-    animation.
+    lengths: link lengths in any unit. hangs: whether gravity acts in the arm's plane (downwards in the animation).
+    caption: text below the animation.
     """
 
     interval: float

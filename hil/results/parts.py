@@ -208,7 +208,7 @@ class ModelChoice:
 
     @property
     def plainest(self) -> str:
-        """The model with the fewest parameters among those that could be evaluated."""
+        """Of the models that could be evaluated, the one with the fewest parameters."""
         judged = [trial for trial in self.tried if trial.score is not None]
         return min(judged, key=lambda trial: trial.parameters).model if judged else self.chosen
 

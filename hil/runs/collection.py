@@ -34,7 +34,7 @@ class RunSummary:
     """Summary of one run.
 
     started: None if run.json does not contain it. verdict: "yes", "with care", "no", or what is missing. residual:
-    residual of the worst joint in encoder steps; None without a result. steps: number of pilot and intermediate runs in
+    that of the worst joint in encoder steps; None without a result. steps: number of pilot and intermediate runs in
     the run folder.
     """
 
@@ -67,7 +67,7 @@ def find_runs(folder: str | PathLike[str]) -> list[RunSummary]:
 
 
 def summarise(path: Path) -> RunSummary:
-    """Summarise one run folder; damaged files are mentioned in the summary and raise no exception."""
+    """Summarise one run folder; damaged files are mentioned in the summary and do not raise an exception."""
     facts = _facts(path)
     arm = Path(str(facts.get("config", ""))).stem or path.name
     verdict, residual = _outcome(path)

@@ -82,7 +82,7 @@ class Recorder:
         self._path = path
         front = f"<dddBBh{4 * joints}d{2 * joints}B"
         self._row = struct.Struct(f"{front}{3 * joints}f")
-        # In most rows the last values are NaN: packed once, they are copied.
+        # In most rows the last values are NaN: they are packed once, then copied.
         self._row_without_slow = struct.Struct(f"{front}{12 * joints}s")
         self._nothing_slow = (struct.pack(f"<{3 * joints}f", *[float("nan")] * (3 * joints)),)
         dtype = sample_type(joints)
@@ -164,7 +164,8 @@ class Recorder:
             lost = self._save_again()
         except OSError as error:
             lost = RunFolderError(
-                f"{self._path} cannot be cut to its {self.count} samples ({error.strerror}), but holds all of them."
+                f"{self._path} cannot be truncated to its {self.count} samples ({error.strerror}), "
+                "but holds all of them."
             )
         else:
             return

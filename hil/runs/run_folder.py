@@ -64,8 +64,8 @@ class RunFacts:
 
     config: path of the configuration, as the user wrote it. command_to_sample: time from the arrival of the goal
     currents at the servos to the sampling of their positions [s]. position_step: encoder step of each joint [rad].
-    segments: role of each multisine, in the order of the experiment. monitoring: a warning about what could hardly be
-    monitored; "" if there is none.
+    segments: role of each multisine, in the order of the experiment. monitoring: a warning about what could not be
+    monitored closely; "" if there is none.
     """
 
     config: str
@@ -262,7 +262,7 @@ class RunFolder:
 
     def write_played(self, played: Config) -> None:
         """Save the [experiment] and [stabiliser] tables actually used, if they differ from the file (pilot, computed
-        torque or gains), and the pose in which a spatial arm lay.
+        torque or gains), and the rest pose of a spatial arm.
         """
         write_json(self.played_path, played.experiment.model_dump())
         if played.stabiliser is not None:
@@ -271,8 +271,8 @@ class RunFolder:
             write_json(self.rest_pose_path, {"rest_pose": list(played.arm.rest_pose)})
 
     def set_aside(self, name: str, played: Config) -> None:
-        """Move the recording of a run to the subfolder `name`, so that another run can use this folder. played: the
-        moved run's configuration.
+        """Move the run's recording to the subfolder `name`, so that another run can use this folder. played: the
+        configuration with which it was recorded.
         """
         folder = self.below(name, played)
         try:

@@ -80,7 +80,7 @@ def _silence() -> None:
 
 @contextmanager
 def _cluster(engine: EngineTable, scheduler: str | None, count: int) -> Iterator[Any]:
-    """Start or find a cluster; yield what a client connects to, and close what was started here."""
+    """Start or find a cluster; yield what a client connects to, then close whatever was started here."""
     memory = f"{engine.worker_memory_gib:g}GiB"
     if scheduler is None:
         with _local(count, memory) as cluster:

@@ -100,7 +100,7 @@ class _Flight(Generic[Item, Result]):
         return self._window - len(self._tasks)
 
     def start(self, count: int) -> list[Any]:
-        """Futures of up to `count` further tasks, as long as there are jobs."""
+        """Submit up to `count` further tasks while there are jobs left; return their futures."""
         taken = (list(islice(self._waiting, self._size)) for _ in range(count))
         return self._submit([jobs for jobs in taken if jobs])
 
@@ -115,10 +115,10 @@ class _Flight(Generic[Item, Result]):
         return futures
 
     def end(self, key: str, result: Any, *, lost: bool) -> tuple[list[Any], list[Ended[Item, Result]]]:
-        """Futures of the jobs that are repeated, and the jobs that have ended."""
+        """Record the end of a task; return the futures of the jobs that are repeated, and the jobs that have ended."""
         jobs = self._tasks.pop(key)
         if lost and len(jobs) > 1:
-            return self._submit([[job] for job in jobs]), []  # one of them kills its worker
+            return self._submit([[job] for job in jobs]), []  # one of the jobs kills its worker: find out which
         if lost:
             return [], [Ended(*jobs[0], None, result[1])]
         outcomes, seconds = result

@@ -15,9 +15,9 @@ from hil.study.fleet import UNLIKE, fleets
 FILE_NAME = "study.html"
 _BINS = 24
 _MOST_ARMS = 200
-"""Largest number of arms listed in a fleet's table on the page; the dataset contains all of them."""
+"""Maximum number of arms listed in a fleet's table on the page; the dataset contains all of them."""
 _MANY = 100
-"""Smallest number of values for which a histogram leaves out the lowest 1 % and the highest 1 % of them."""
+"""Minimum number of values for which a histogram leaves out the lowest 1 % and the highest 1 % of them."""
 
 
 def write_page(table: pa.Table, title: str, path: Path) -> Figures:

@@ -120,7 +120,7 @@ class Conversation(SingleInstructions):
         return listed
 
     def until_silence(self, listed: list[int], *, fast: bool) -> list[Servo]:
-        """Servos that answer; a silent servo silences those after it (ROBOTIS, DynamixelSDK issue 364)."""
+        """Return the servos that answer; a silent servo silences those after it (ROBOTIS, DynamixelSDK issue 364)."""
         found = []
         for servo_id in listed:
             servo = self.named(servo_id)

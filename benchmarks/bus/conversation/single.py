@@ -162,8 +162,8 @@ class SingleInstructions(Host):
         self.settle(servo, [WATCHDOG, TORQUE_ENABLE])
 
     def alarm(self) -> None:
-        """Set Min Voltage Limit above the supply: every status then has the alert, and torque is off if Shutdown has
-        that bit; only restoring the limit and rebooting ends this.
+        """Set Min Voltage Limit above the supply: every status then carries the alert, and torque is off if Shutdown
+        has that bit; only restoring the limit and rebooting ends this.
         """
         servo = self.any_servo()
         held = servo.rules.held

@@ -24,7 +24,7 @@ def clearance(data: RunData) -> Section | None:
     space = Space.of(data.config)
     rows = [_row(space, name, _poses(data, space, phases), way) for name, phases, way in _PHASES]
     table = Table(("where", "between", "least", "required"), tuple(row for row in rows if row), 2)
-    words = ("Least clearance of the recorded motion. In and near the rest pose, the arm may touch what it lies on.",)
+    words = ("Least clearance of the recorded motion. In and near the rest pose, the arm may touch what it rests on.",)
     return Section("clearance", "Clearance", words, (table,), bullets=(*near_by_design(space), *unchecked(space)))
 
 

@@ -1,4 +1,4 @@
-"""Section on parameters that the data hardly separate."""
+"""Section on correlated parameters, which the data can barely distinguish."""
 
 import numpy as np
 

@@ -67,18 +67,18 @@ def _curve(
     line, said = model_curve(at, curve, low, high)
     series = (
         Series("from the measured motion", measured[0][joint], measured[1][joint], GREY, "dots"),
-        # Fewer, since both motions are so alike that these would hide those of the measured one.
+        # Fewer dots: the two motions are so similar that these would otherwise hide those of the measured one.
         Series("from the model's motion", simulated[0][joint, ::_FEWER], simulated[1][joint, ::_FEWER], ORANGE, "dots"),
         *line,
     )
     chart = Chart(f"friction_{joint + 1}", f"Friction of {name}", "speed [rad/s]", "friction [N m]", series)
     load = data.model.values.get(f"load_{joint + 1}")
-    more = f" It also grows with the motor torque, by {load:.3g} N m per N m, which is not drawn." if load else ""
+    more = f" It also grows with the motor torque, by {load:.3g} N m per N m (not drawn)." if load else ""
     return Picture(chart, f"{name}: friction versus speed, without the constant offset.{said}{more}")
 
 
 def model_curve(at: Array, curve: Array, low: Array, high: Array) -> tuple[tuple[Series, ...], str]:
-    """The model's friction with its interval, or a sentence if the interval is narrower than the line."""
+    """The model's friction curve with its interval, or with a sentence if the interval is narrower than the line."""
     line = Series("model", at, curve, BLUE)
     if float(np.max(high - low)) < _LINE * float(np.ptp(curve)):
         return (line,), " The 95 % interval is narrower than the line."

@@ -1,4 +1,4 @@
-"""Section on how much of each limit the run used."""
+"""Section on how close the run came to each limit."""
 
 import numpy as np
 from numpy.typing import NDArray

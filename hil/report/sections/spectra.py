@@ -28,7 +28,7 @@ def spectra(data: RunData) -> Section | None:
         return None
     excited = _excited(data)
     words = (
-        "Each joint has its own spectral lines, so that the coupling between the joints can be separated. The response "
+        "Each joint has its own spectral lines, so that their effects on one another can be told apart. The response "
         "between and above the excited lines comes from the arm's nonlinearity, mainly friction: the model must "
         "explain it too, and it contains information about the parameters. This response should be well above the "
         "noise.",

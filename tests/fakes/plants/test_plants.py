@@ -140,7 +140,7 @@ def test_tilt_is_less_gravity() -> None:
     ("changes", "said"),
     [
         ({"stops": [1.0, 0.5]}, "the first must be less than the second"),
-        ({"stops": [0.0, 0.5]}, "beyond its stops"),
+        ({"stops": [0.0, 0.5]}, "beyond its hard stops"),
         ({"backlash": 0.01, "rotor_inertia": 0.0}, "backlash needs a rotor_inertia"),
     ],
 )

@@ -151,7 +151,7 @@ def test_without_free_file_descriptors_torque_and_recording_are_still_said(
     monkeypatch.setattr(Path, "rglob", fails)
     assert hil("record", arm_file(*QUICK), "--out", tmp_path / "run") == 1
     said = capsys.readouterr().err.splitlines()
-    assert re.search(r"samples\.npy cannot be cut to its \d+ samples \(Too many open files\), but holds all", said[0])
+    assert re.search(r"npy cannot be truncated to its \d+ samples \(Too many open files\), but holds all", said[0])
     assert said[1] == "Torque is off on both servos, confirmed by reading it back."
     assert said[-1] == f"Next: hil estimate {tmp_path / 'run'}", "the rows are there"
 

@@ -373,7 +373,7 @@ def test_torque_that_another_program_keeps_switching_on_is_said_in_capitals(
     assert bench.servos[2].torque_enabled
     said = message(ended.value)
     assert said.startswith("hil: TORQUE IS ON AT JOINT 'ELBOW' (ID 2, XM430-W350): ANOTHER PROGRAM TURNS IT BACK ON")
-    assert "CUT THE SUPPLY NOW" in said and "Torque is off on joint 'shoulder' (ID 1" in said
+    assert "CUT THE POWER NOW" in said and "Torque is off on joint 'shoulder' (ID 1" in said
     assert "both servos" not in "\n".join((said, *getattr(stop, "__notes__", ())))
     assert ("It swings." in said) is (stop is not None)
 
