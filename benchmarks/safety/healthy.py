@@ -31,7 +31,9 @@ WIDE_RAD, WIDE_RAD_S = 3.1, 25.0
 RESTS_S = 5.0
 
 _SKIPPED = frozenset({"fake_inverted", "paper_two_link"})
-"""Arms whose motion only their own description keeps bounded, and one that hangs from a third joint's limits."""
+"""Arms that are not drawn: an inverted one, which only a controller designed for its exact description keeps upright,
+and the seed paper's, which moves by only a few degrees.
+"""
 
 
 def draw(seed: int, setting: Setting, period: float, *, described: bool) -> dict[str, Any]:

@@ -146,7 +146,7 @@ def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tup
 
 
 def _torque_instead(other: SettledPeriod | None, estimate: Estimate, drift: Drift | None) -> TorqueChange | None:
-    """The constant torque that explains the held-out period better than a change of friction; None if there is none."""
+    """The constant torque that explains the held-out period better than a change in friction; None if there is none."""
     if other is None or drift is None:
         return None
     # A torque that friction cannot explain makes the change of friction so uncertain that none is detected.

@@ -1,4 +1,4 @@
-"""The mean residual of the last lessons, against a direct calculation."""
+"""The mean residual of the last updates, against a direct calculation."""
 
 import numpy as np
 import pytest
@@ -25,15 +25,15 @@ COVARIANCE = np.array([[0.04, 0.01, 0.0], [0.01, 0.02, 0.0], [0.0, 0.0, 0.01]])
 NOISE, FRICTION, ROUNDING = 1e-3, 0.3, 2e-3
 
 
-def played(lessons: int, excess: float = 0.0, velocity: float = 1.0, stands: float = 0.0) -> np.ndarray:
-    """Memory after two samples per lesson, whose torque exceeds that of the model by `excess` [N m] from half of the
-    lessons on.
+def played(updates: int, excess: float = 0.0, velocity: float = 1.0, stands: float = 0.0) -> np.ndarray:
+    """Memory after two samples per update, whose torque exceeds that of the model by `excess` [N m] from half of the
+    updates on.
     """
     past = earlier_model.memory(COUNT)
-    for number in range(2 * lessons):
+    for number in range(2 * updates):
         row = np.array([np.sin(number), np.cos(number), 1.0])
         for joint in (0, 1):
-            further = excess if joint and number >= lessons else 0.0
+            further = excess if joint and number >= updates else 0.0
             add(past, joint, float(row @ THETA) + further, stands, velocity, row, DT)
             describe(past, joint, COUNT, NOISE, FRICTION)
         if number % 2:
@@ -45,9 +45,9 @@ def compared(past: np.ndarray, back: int, floor: float = 0.0, joint: int = 1) ->
     return compare(past, joint, back, COUNT, floor, ROUNDING, FILTER_S)
 
 
-def limit(back: int, lessons: int = 40, velocity: float = 1.0, stands: float = 0.0) -> float:
+def limit(back: int, updates: int = 40, velocity: float = 1.0, stands: float = 0.0) -> float:
     """Mean residual torque that the earlier model just explains [N m]."""
-    numbers = np.arange(2 * (lessons - back) + 2, 2 * lessons)  # from the sample after the moment compared with
+    numbers = np.arange(2 * (updates - back) + 2, 2 * updates)  # from the sample after the moment compared with
     row = np.array([np.sin(numbers).mean(), np.cos(numbers).mean(), 1.0])
     seconds = DT * numbers.size
     variance = (
@@ -76,7 +76,7 @@ def test_a_mean_below_the_floor_does_not_count() -> None:
     assert compared(past, 5, floor=3.1) == 0.0
 
 
-def test_as_many_lessons_as_are_compared_must_be_stored() -> None:
+def test_as_many_updates_as_are_compared_must_be_stored() -> None:
     assert compared(played(4, 5.0), 5) == 0.0
     past = played(12, 5.0)
     assert compared(past, 5) != 0.0
@@ -84,7 +84,7 @@ def test_as_many_lessons_as_are_compared_must_be_stored() -> None:
     assert compared(past, 5) == 0.0
 
 
-def test_a_mean_must_be_unexplained_in_successive_lessons() -> None:
+def test_a_mean_must_be_unexplained_in_successive_updates() -> None:
     past = earlier_model.memory(COUNT)
     for mean, found in ((0.4, 0.0), (0.0, 0.0), (0.4, 0.0), (-0.5, -0.5), (0.0, 0.0)):
         keep(past, 1, mean)

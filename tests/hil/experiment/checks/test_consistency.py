@@ -310,7 +310,7 @@ def test_both_memories_and_what_is_learnt_are_what_their_definitions_say() -> No
     look, now, before, former = Consistency(), 0.0, 0.0, 0.0
     short = long = _Reference(SHORT_S, 0.0)
     waiting: list[tuple[float, ...]] = []
-    lessons: list[tuple[float, float, float, float]] = []
+    updates: list[tuple[float, float, float, float]] = []
     learnt: tuple[float, ...] = ()
     done = since = 0.0
     for index in range(1100):
@@ -335,14 +335,14 @@ def test_both_memories_and_what_is_learnt_are_what_their_definitions_say() -> No
                 long.rows.append((*sums[:2], velocity, sums[2], max(each[4] for each in waiting), sums[3]))
                 waiting = []
             memory = look.memory["short"]
-            lessons.append(
+            updates.append(
                 tuple(float(each) for each in (velocity - memory["mean"], memory["far"], seconds, memory["apart"]))
             )
             since += seconds
             if since >= BLOCK_S:
                 since = 0.0
                 if done < ALL_INFORMATION:
-                    learnt = _fitted(lessons)
+                    learnt = _fitted(updates)
                     done = learnt[-1]
         before, former = velocity, position
     for memory, reference in ((look.memory["short"], short), (look.memory["long"], long)):
@@ -355,9 +355,9 @@ def test_both_memories_and_what_is_learnt_are_what_their_definitions_say() -> No
     assert look.memory["lag"] < LAG_S and look.memory["scale"] < SCALE
 
 
-def _fitted(lessons: list[tuple[float, float, float, float]]) -> tuple[float, ...]:
+def _fitted(updates: list[tuple[float, float, float, float]]) -> tuple[float, ...]:
     """Lag, scale error, their standard deviations and the information about the lag, from a weighted fit."""
-    signals = np.array(lessons)
+    signals = np.array(updates)
     weights = np.sqrt(signals[:, 2])
     design = weights[:, None] * np.column_stack((signals[:, 0], signals[:, 1], np.ones(len(signals))))
     measured = weights * signals[:, 3]
