@@ -10,7 +10,8 @@ from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.config.schema import Config
 from hil.errors import ConfigError
 from hil.results.display import html_table
-from hil.setup.preflight import Finding, Level, check_arm
+from hil.setup.finding import Finding, Level
+from hil.setup.preflight import check_arm
 
 _ALWAYS_HELD_HZ = 150.0
 """Rate [Hz] from which the stabiliser's delay does not matter; it is then not checked, since loading the pilot for this

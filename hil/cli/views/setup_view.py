@@ -11,7 +11,7 @@ from rich.table import Table
 from hil.config.schema import config_of
 from hil.next_step import NEXT, next_step
 from hil.printing import print_fitting, result_console, say, say_behind
-from hil.setup.preflight import Finding, Level
+from hil.setup.finding import Finding, Level
 from hil.setup.scan import Found, Heard
 from hil.setup.servo_settings import Change
 

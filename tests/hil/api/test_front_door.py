@@ -19,7 +19,8 @@ from hil.errors import ConfigError, CsvError, MissingExtra, ResultError, RunFold
 from hil.estimation.changes.diff import diff_runs
 from hil.results.result import SettledResult
 from hil.runs.collection import find_runs
-from hil.setup.preflight import Level, check_arm
+from hil.setup.finding import Level
+from hil.setup.preflight import check_arm
 from tests.support.command_line import hil as command
 from tests.support.edits import QUICK, QUICK_WITH_HELD_OUT
 

@@ -21,7 +21,8 @@ from hil.plan.plan import make_plan
 from hil.plan.stabiliser import too_slow
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
-from hil.setup.preflight import Level, check_arm
+from hil.setup.finding import Level
+from hil.setup.preflight import check_arm
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 

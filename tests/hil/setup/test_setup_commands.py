@@ -21,7 +21,8 @@ from hil.fakes.bus.faults import Fault
 from hil.fakes.description import load_fake
 from hil.fakes.protocol_fake import open_fake
 from hil.setup import preflight
-from hil.setup.preflight import Finding, Level, check_arm
+from hil.setup.finding import Finding, Level
+from hil.setup.preflight import check_arm
 from hil.setup.scan import Asking, Found, Heard, listen, scan
 from hil.setup.servo_settings import open_servo, set_up
 from tests.support.edits import replaced

@@ -9,7 +9,8 @@ from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import TorqueHeld, WrongSetting
 from hil.drivers.servo import Servo
-from hil.setup.preflight import Finding, Level, check_arm
+from hil.setup.finding import Finding, Level
+from hil.setup.preflight import check_arm
 from hil.setup.session.servo_session import servo_session
 from tests.support.bench import SHORT, Arm, Bench, play
 

@@ -18,7 +18,8 @@ from hil.drivers.errors import PortLost, TorqueNotOff, WrongSetting
 from hil.errors import RunFolderError
 from hil.fakes.bus.faults import Fault
 from hil.fakes.servo.servo import EmulatedServo
-from hil.setup.preflight import Level, check_arm
+from hil.setup.finding import Level
+from hil.setup.preflight import check_arm
 from hil.setup.session import settings_file
 from hil.setup.session.saved_settings import SavedSettings
 from hil.setup.session.servo_session import servo_session

@@ -14,7 +14,8 @@ from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import TorqueHeld, TorqueNotOff
 from hil.fakes.bus.faults import Fault
-from hil.setup.preflight import Level, check_arm
+from hil.setup.finding import Level
+from hil.setup.preflight import check_arm
 from hil.setup.session import settings_file
 from hil.setup.session.servo_session import servo_session
 from tests.support.bench import SHORT, Arm, Bench

@@ -19,7 +19,8 @@ from hil.drivers.preparation.prepare import prepare_servo
 from hil.drivers.servo import Servo
 from hil.errors import Cause, ExperimentError, HilError, SafetyStop, StopRequested
 from hil.fakes.bus.faults import Fault
-from hil.setup.preflight import Finding, Level, check_arm
+from hil.setup.finding import Finding, Level
+from hil.setup.preflight import check_arm
 from hil.setup.session.end_of_session import about_torque
 from hil.setup.session.saved_settings import SavedSettings
 from hil.setup.session.servo_session import COUNT_DOWN_S, ServoSession, servo_session
