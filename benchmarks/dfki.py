@@ -64,7 +64,7 @@ def load(folder: Path, pattern: str, torque: str) -> list[Recording]:
 
 
 def idle_inertia(folder: Path) -> list[float]:
-    """Regression of the measured torque of an undriven joint on its acceleration [kg m^2], for each joint."""
+    """For each joint, the slope of its measured torque over its acceleration while it is not driven [kg m^2]."""
     pairs = list(zip(*(load(folder, "c1_sinusoids_*.csv", torque) for torque in ("con", "meas")), strict=True))
     found = []
     for joint in range(2):

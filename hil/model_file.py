@@ -151,7 +151,9 @@ def _check_chain(values: dict[str, float], geometry: Geometry, chain: ChainFacts
 
 
 def _damaged(path: Path, error: FormError) -> ResultError:
-    return ResultError(f"{_file(path)} is damaged or from an older hil: it {error}. Run hil estimate again.")
+    return ResultError(
+        f"{_file(path)} is damaged or was written by an older version of hil: it {error}. Run hil estimate again."
+    )
 
 
 def _file(path: Path) -> Path:

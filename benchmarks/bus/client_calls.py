@@ -173,7 +173,7 @@ def dxl2(device: str) -> Iterator[Call]:
 
 
 def pypot(device: str) -> Iterator[Call]:
-    """Calls of pypot on xl320: two XL-320, the only servos with which pypot uses Protocol 2.0."""
+    """Calls that pypot makes on xl320, an arm of two XL-320, the only servos with which pypot uses Protocol 2.0."""
     from pypot.dynamixel import Dxl320IO
 
     # It flushes unsent output before each packet, which on a pty would drop a Sync Write that has not been read yet.

@@ -48,7 +48,7 @@ REST_S = 1.5
 
 
 class Sleeping(WallClock):
-    """The wall clock, without spinning before a deadline."""
+    """A wall clock that does not busy-wait before a deadline."""
 
     def wait_until(self, deadline: float) -> None:
         time.sleep(max(0.0, deadline - self.now()))

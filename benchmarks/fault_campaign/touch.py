@@ -77,7 +77,7 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
 
 
 def overwrite_goals(attack: Attack, port: "Middle") -> None:
-    """Write a different goal, like a second master that sends its own command after each command of the program."""
+    """Write a different goal, as a second master would if it sent its own command after each of the program's."""
     for servo in port.bus._servos:
         if attack.concerns(servo.id) and servo.torque_enabled:
             address, goal = _write_goal(attack, servo)

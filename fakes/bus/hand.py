@@ -121,7 +121,7 @@ class Hand:
         for move in moves:
             if move.at == 0.0 and (driving := self._driving(self._joint_of(move))):
                 raise ValueError(
-                    f"the torque of servo {driving[0]} is on, and the hand moves only joints whose torque is off: "
+                    f"the torque of servo {driving[0]} is on, but a hand can only move joints whose torque is off: "
                     "write 0 to its Torque Enable first"
                 )
         self.schedule(*moves)

@@ -22,7 +22,7 @@ Blocks = tuple[tuple[int, int, int], ...]
 
 @dataclass(frozen=True, slots=True)
 class RegisterFacts:
-    """Properties of a register that control tables lack. `limits` is None for the full range of its bytes."""
+    """Register properties that control tables do not state. `limits` is None if every value fitting its bytes is accepted."""
 
     initial: int = 0
     limits: tuple[int, int] | None = None

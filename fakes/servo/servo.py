@@ -94,7 +94,8 @@ class EmulatedServo(Powered):
         self.has_fast_reads = firmware >= model.fast_read_firmware
         """Whether the servo supports Fast Sync Read, Fast Bulk Read and Control Table Backup."""
         self.connected = True
-        """False if the bus cable is disconnected: the servo neither receives nor replies; the motor keeps its command.
+        """False if the bus cable is disconnected: the servo then neither receives nor replies, and its motor
+        continues to follow the last command.
         """
         self.heard_at = 0.0
         """Time at which the servo received its last instruction packet [s]; the Bus Watchdog counts from then."""

@@ -144,7 +144,9 @@ class SafetyConfig(Table):
     max_voltage: PositiveFloat = Field(30.0, le=60, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s, time for which a current may deviate from its goal")
     follow_share: PositiveFloat = Field(
-        0.3, le=1, description="deviation of a current allowed without time limit, as a fraction of the planned peak"
+        0.3,
+        le=1,
+        description="largest current deviation that is allowed indefinitely, as a fraction of the planned peak",
     )
     take_over: bool = Field(
         False, description="take over an arm whose torque is on, and lower it slowly; by default such an arm is refused"

@@ -177,7 +177,7 @@ def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array
 
 
 def _within_limits(config: Config, moved: Response) -> int:
-    """Number of samples, at least two, before the guard stops the motion at a limit."""
+    """Number of samples before the guard stops the motion because a limit is exceeded; at least two."""
     low, high = (np.array(side)[:, None] for side in zip(*(j.position_limit for j in config.joints), strict=True))
     fastest = np.array([joint.velocity_limit for joint in config.joints])[:, None]
     passed = (moved.position < low) | (moved.position > high) | (np.abs(moved.velocity) > fastest)

@@ -67,7 +67,7 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
 
 
 def _export_own_urdf(found: ChainLinks, model: ChainArmModel, path: Path) -> list[str]:
-    """Write the URDF of an arm that was described by MJCF, with its joints, frames and body names."""
+    """Write the URDF of an arm described in MJCF, with its joints, frames and body names."""
     root = ET.Element("robot", name=found.path.stem)
     rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
     left = ["the MJCF's shapes", *_held(found), *rotors, *found.left_out]

@@ -1,3 +1,3 @@
-"""Many independent runs on a distributed engine: populations of arms, Monte Carlo, fault campaigns, fleets of
-recordings.
+"""Many independent runs on a distributed engine: populations of arms, Monte Carlo studies, fault campaigns and
+large sets of recordings.
 """

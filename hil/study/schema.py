@@ -166,7 +166,7 @@ class Study(_Table):
 
 
 def load_study(path: Path) -> Study:
-    """Read and check the file. Raises ConfigError, whose message names file, key, value and what is allowed."""
+    """Read and check the file. Raises ConfigError; its message names the file, the key, the value and the allowed values."""
     try:
         values = load_toml(path)
     except TomlFileError as error:
