@@ -22,7 +22,7 @@ Blocks = tuple[tuple[int, int, int], ...]
 
 @dataclass(frozen=True, slots=True)
 class RegisterFacts:
-    """Register properties that control tables do not state. `limits` is None if every value fitting its bytes is accepted."""
+    """Register properties that control tables do not state. `limits` is None if any value that fits is accepted."""
 
     initial: int = 0
     limits: tuple[int, int] | None = None

@@ -146,7 +146,7 @@ class SafetyConfig(Table):
     follow_share: PositiveFloat = Field(
         0.3,
         le=1,
-        description="largest current deviation that is allowed indefinitely, as a fraction of the planned peak",
+        description="largest current deviation allowed indefinitely, as a fraction of the planned peak",
     )
     take_over: bool = Field(
         False, description="take over an arm whose torque is on, and lower it slowly; by default such an arm is refused"

@@ -100,9 +100,9 @@ def test_damage_is_named(identified: Path, path: tuple[str, ...], value: Any, sa
     file.write_text(json.dumps(raw), encoding="utf-8")
     with pytest.raises(ResultError) as caught:
         read_result(identified)
-    assert str(caught.value).startswith(
-        f"{file} is damaged or was written by an older version of hil: it "
-    ) and said in str(caught.value)
+    message = str(caught.value)
+    assert message.startswith(f"{file} is damaged or was written by an older version of hil: it ")
+    assert said in message
 
 
 def test_a_pair_needs_two_entries() -> None:
