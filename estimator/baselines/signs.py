@@ -60,6 +60,13 @@ class Signs:
         plural = "s" if self.are_several else ""
         return f"the sign{plural} of {' and '.join(each for each in listed if each)}"
 
+    def fewest(self) -> "Signs":
+        """These signs or the opposite ones, whichever reverse fewer columns: both describe the same motion, since the
+        opposite signs are those of the mirror image of the arm.
+        """
+        mirrored = Signs(*(tuple(-sign for sign in signs) for signs in (self.torque, self.position)))
+        return min(self, mirrored, key=lambda each: len(each.reversed_columns))
+
     @property
     def are_several(self) -> bool:
         """Whether more than one column is reversed."""
@@ -114,7 +121,7 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
         )
         if credible and (best is None or residual < best[0]):
             best = residual, signs
-    return None if best is None else Suspicion(best[1], best[0], left, impossible)
+    return None if best is None else Suspicion(best[1].fewest(), best[0], left, impossible)
 
 
 @dataclass(frozen=True)

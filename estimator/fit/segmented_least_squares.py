@@ -6,7 +6,8 @@ segment's block is eliminated separately (Schur complement).
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +26,13 @@ Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
 the segment's own coordinates (rows, shared + own).
 """
 
+_Step = tuple[Array, Array]
+"""A step of the shared coordinates (shared,) and of the segments' own (segments, own), or coordinates after one."""
+
 DEFAULTS = SegmentedMinimiserOptions()
 MIN_SEGMENTS = 3
+CURVATURE_STEP = 0.1  # fraction of a step over which the curvature of the residuals is measured
+MOST_ACCELERATION = 0.75  # length of the acceleration relative to that of the step
 MIN_EIGENVALUE = 1e-12  # relative to the largest; directions below have no effect on the residual
 MIN_PART = 1e-4  # squared component of a coordinate in such a direction; anything smaller is rounding error
 
@@ -128,32 +134,85 @@ def _inverse(matrix: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class _Blocks:
-    """Normal equations, one block per segment."""
+class _Damping:
+    """Damping of the next step."""
 
+    factor: float
+    size: Array
+    """Largest squared sensitivity to each shared coordinate so far (shared,); it scales the damping (More, 1978), so
+    that a coordinate that loses its effect does not run away.
+    """
+    options: SegmentedMinimiserOptions
+
+    @property
+    def max_step(self) -> float:
+        """Maximum change in a coordinate."""
+        return self.options.max_step
+
+    def limited(self, step: _Step) -> _Step:
+        """Return the step with every change limited to `max_step`."""
+        return np.clip(step[0], -self.max_step, self.max_step), np.clip(step[1], -self.max_step, self.max_step)
+
+    def lower(self) -> "_Damping":
+        """Return the damping after a successful step."""
+        return replace(self, factor=max(0.2 * self.factor, self.options.min_damping))
+
+    def higher(self) -> "_Damping":
+        """Return the damping after a failed step."""
+        return replace(self, factor=8.0 * self.factor)
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Normal equations at one point, with one block per segment."""
+
+    residual: list[Array]
+    """r: residuals of each segment (rows,)."""
+    derivative: list[Array]
+    """J: their derivatives with respect to the shared and the segment's own coordinates (rows, shared + own)."""
     shared: Array
     """J'J of the shared coordinates (segments, shared, shared)."""
     mixed: Array
     """J'J between shared and own coordinates (segments, shared, own)."""
     own: Array
     """J'J of the own coordinates (segments, own, own)."""
-    shared_gradient: Array
-    """J'r of the shared coordinates (segments, shared)."""
-    own_gradient: Array
-    """J'r of the own coordinates (segments, own)."""
+    prior: Expected
+    pull: Array
+    """Gradient of the prior (shared,)."""
 
-    def reduced(self, damping: float) -> tuple[Array, Array, Array, Array]:
-        """Return information and scores with the segments' own coordinates eliminated, and two terms for recovering
-        these.
+    @property
+    def size(self) -> Array:
+        """Squared sensitivity of residuals and prior to the shared coordinates (shared,)."""
+        return np.asarray(np.diag(self.shared.sum(axis=0)) + self.prior.precision)
+
+    def eliminated(self, rows: Sequence[Array], damping: float) -> tuple[Array, Array, Array, Array]:
+        """Return information and scores for residuals `rows`, with the segments' own coordinates eliminated, and two
+        terms for recovering these.
         """
+        gradient = np.stack([J.T @ r for J, r in zip(self.derivative, rows, strict=True)])
+        shared_gradient, own_gradient = np.split(gradient, [self.shared.shape[1]], axis=1)
         eye = np.eye(self.own.shape[1])
         scale = np.diagonal(self.own, axis1=1, axis2=2).max(axis=1)[:, None, None] * 1e-14
         damped = self.own + damping * self.own * eye + scale * eye
         solve = linalg.solve(damped, np.swapaxes(self.mixed, 1, 2))
-        known = linalg.solve(damped, self.own_gradient[:, :, None])[:, :, 0]
+        known = linalg.solve(damped, own_gradient[:, :, None])[:, :, 0]
         information = self.shared.sum(axis=0) - np.einsum("sij,sjk->ik", self.mixed, solve)
-        scores = self.shared_gradient - np.einsum("sij,sj->si", self.mixed, known)
-        return information, scores, solve, known
+        scores = shared_gradient - np.einsum("sij,sj->si", self.mixed, known)
+        return information + np.diag(self.prior.precision), scores, solve, known
+
+    def solved(self, rows: Sequence[Array], pull: Array, damping: _Damping) -> _Step:
+        """Return the damped Gauss-Newton step that reduces `rows`. pull: gradient of the prior (shared,)."""
+        information, scores, solve, known = self.eliminated(rows, damping.factor)
+        scale = np.sqrt(np.maximum(damping.size, 1e-12 * damping.size.max()))
+        matrix = information / np.outer(scale, scale) + damping.factor * np.eye(pull.size)
+        step = -linalg.lstsq(matrix, (scores.sum(axis=0) + pull) / scale, rcond=1e-13)[0] / scale
+        step = np.clip(step, -damping.max_step, damping.max_step)
+        return damping.limited((step, -known - np.einsum("sij,j->si", solve, step)))
+
+    def length(self, step: _Step) -> float:
+        """Return the length of a step, weighted by the sensitivity of the residuals."""
+        weights = self.size, np.diagonal(self.own, axis1=1, axis2=2)
+        return float(np.sqrt(sum(np.sum(weight * part**2) for weight, part in zip(weights, step, strict=True))))
 
 
 def minimise_segmented(
@@ -166,7 +225,7 @@ def minimise_segmented(
     expected: Expected | None = None,
     move: Callable[[Array, Array], Array] = np.add,
 ) -> Segmented:
-    """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
+    """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt with geodesic acceleration.
 
     `residual` and `derivative` are called from several threads; their number does not affect the result.
 
@@ -193,28 +252,33 @@ def minimise_segmented(
                 "the simulation diverges at the initial guess: too little motion was recorded, or torque or time "
                 "is in the wrong unit"
             )
-        damping = options.initial_damping
+
+        def after(shared: Array, own: Array, step: _Step) -> tuple[Array, Array, list[Array]]:
+            there = move(shared, step[0]), own + step[1]
+            return (*there, _residuals(residual, *there, threads))
+
+        damping, is_curved, was_small = _Damping(options.initial_damping, np.zeros(shared.size), options), False, False
         for iteration in range(1, options.max_iterations + 1):
-            blocks = _blocks(derivative, shared, own, threads)
-            gained = 0.0
-            while damping < options.max_damping:
-                step, own_there = _stepped(blocks, prior, shared, own, damping, options.max_step)
-                there = move(shared, step), own_there
-                rows_there = _residuals(residual, *there, threads)
+            equations = _equations(derivative, prior, shared, own, threads)
+            damping = replace(damping, size=np.maximum(damping.size, equations.size))
+            gained, is_first = 0.0, True
+            while damping.factor < options.max_damping:
+                step = _step(equations, damping, partial(after, shared, own), is_curved)
+                *there, rows_there = after(shared, own, step)
                 gained = cost - _cost(rows_there) - prior.cost(there[0])
                 if gained > 0.0:
-                    (shared, own), rows, cost = there, rows_there, cost - gained
-                    damping = max(0.2 * damping, options.min_damping)
+                    (shared, own), rows, cost, damping = there, rows_there, cost - gained, damping.lower()
                     break
-                damping = max(8.0 * damping, options.initial_damping)
-            last = iteration == options.max_iterations
-            if gained < ftol * cost or (last and gained < options.unfinished * cost):
-                blocks = _blocks(derivative, shared, own, threads)
-                information, scores, _, _ = blocks.reduced(0.0)
-                information = information + np.diag(prior.precision)
+                damping, is_first, is_curved = damping.higher(), False, True
+            is_curved = not is_first
+            last, is_small = iteration == options.max_iterations, gained < ftol * cost
+            if (is_small and (is_first or was_small)) or (last and gained < options.unfinished * cost):
+                equations = _equations(derivative, prior, shared, own, threads)
+                information, scores, _, _ = equations.eliminated(equations.residual, 0.0)
                 freedom = sum(map(np.count_nonzero, rows)) - shared.size - own.size  # zeros mark missing samples
                 variance = _cost(rows) / max(freedom, 1)
                 return Segmented(shared, own, cost, information, scores, iteration, variance, prior)
+            was_small = is_small
     raise ConvergenceError(
         f"after {options.max_iterations} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} per "
         "iteration: try a simpler friction model or shorter segments"
@@ -230,31 +294,53 @@ def _residuals(residual: Residual, shared: Array, own: Array, threads: ThreadPoo
     return list(threads.map(lambda s: residual(s, shared, own[s]), range(len(own))))
 
 
-def _blocks(derivative: Derivative, shared: Array, own: Array, threads: ThreadPoolExecutor) -> _Blocks:
-    def block(segment: int) -> tuple[Array, Array]:
+def _equations(
+    derivative: Derivative, prior: Expected, shared: Array, own: Array, threads: ThreadPoolExecutor
+) -> _Equations:
+    def block(segment: int) -> tuple[Array, Array, Array]:
         r, J = derivative(segment, shared, own[segment])
         with np.errstate(over="ignore", invalid="ignore"):
-            return J.T @ J, J.T @ r
+            return r, J, J.T @ J
 
-    products = list(threads.map(block, range(len(own))))
-    normal = np.stack([product[0] for product in products])
-    gradient = np.stack([product[1] for product in products])
-    if not (np.isfinite(normal).all() and np.isfinite(gradient).all()):
+    residuals, derivatives, products = zip(*threads.map(block, range(len(own))), strict=True)
+    normal = np.stack(products)
+    if not (np.isfinite(normal).all() and all(np.isfinite(each).all() for each in residuals)):
         raise ConvergenceError("a simulated motion diverges: check the units, signs and directions of torque and angle")
     n = shared.size
-    return _Blocks(normal[:, :n, :n], normal[:, :n, n:], normal[:, n:, n:], gradient[:, :n], gradient[:, n:])
+    blocks = normal[:, :n, :n], normal[:, :n, n:], normal[:, n:, n:]
+    return _Equations(list(residuals), list(derivatives), *blocks, prior, prior.precision * (shared - prior.centre))
 
 
-def _stepped(
-    blocks: _Blocks, prior: Expected, shared: Array, own: Array, damping: float, max_step: float
-) -> tuple[Array, Array]:
-    information, scores, solve, known = blocks.reduced(damping)
-    information = information + np.diag(prior.precision)
-    gradient = scores.sum(axis=0) + prior.precision * (shared - prior.centre)
-    full = np.diag(blocks.shared.sum(axis=0)) + prior.precision
-    scale = np.sqrt(np.maximum(full, 1e-12 * full.max()))
-    matrix = information / np.outer(scale, scale) + damping * np.eye(shared.size)
-    step = -linalg.lstsq(matrix, gradient / scale, rcond=1e-13)[0] / scale
-    step = np.clip(step, -max_step, max_step)
-    own_step = -known - np.einsum("sij,j->si", solve, step)
-    return step, own + np.clip(own_step, -max_step, max_step)
+def _step(
+    equations: _Equations,
+    damping: _Damping,
+    after: Callable[[_Step], tuple[Array, Array, list[Array]]],
+    is_curved: bool,
+) -> _Step:
+    """Return a damped step; if `is_curved`, with geodesic acceleration (Transtrum and Sethna, 2012, arXiv:1201.5885).
+
+    The acceleration makes the step follow curved valleys of the sum of squares, such as that of the encoder zeros of a
+    small motion. It is omitted unless it is small compared with the step. after: returns the coordinates and the
+    residuals after a step.
+    """
+    step = equations.solved(equations.residual, equations.pull, damping)
+    if not is_curved:
+        return step
+    part = CURVATURE_STEP
+    with np.errstate(over="ignore", invalid="ignore"):
+        curvature = [
+            2.0 / part * ((there - here) / part - J @ np.concatenate((step[0], its_own)))
+            for there, here, J, its_own in zip(
+                after((part * step[0], part * step[1]))[2],
+                equations.residual,
+                equations.derivative,
+                step[1],
+                strict=True,
+            )
+        ]
+    if not all(np.isfinite(each).all() for each in curvature):
+        return step
+    bend = equations.solved(curvature, np.zeros_like(equations.pull), damping)
+    if equations.length(bend) >= MOST_ACCELERATION * equations.length(step):
+        return step
+    return damping.limited((step[0] + 0.5 * bend[0], step[1] + 0.5 * bend[1]))

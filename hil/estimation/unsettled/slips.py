@@ -56,7 +56,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
     if _is_clear(signs.residual, signs.residual_given):
         raise CsvError(
             f"{source}: {reversal_said(signs.signs)}, {unexplained(signs.residual, signs.residual_given)}. "
-            "Correct this in the file, or swap the columns."
+            f"{_correction(signs.signs, zero)}"
         )
     # Reversing all torques leaves the same residual, but no body has a negative inertia.
     inertias = [name for name in signs.impossible if name.startswith("inertia")]
@@ -64,8 +64,17 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
         verb = "are" if signs.signs.are_several else "is"
         raise CsvError(
             f"{source}: {signs.signs.said()} {verb} reversed: as given, {' and '.join(inertias)} would be negative. "
-            "Correct this in the file, or reverse the positions."
+            f"{_correction(signs.signs, zero)}"
         )
+
+
+def _correction(signs: Signs, zero: Sequence[float] | None) -> str:
+    """Say how to reverse columns; the zero of a reversed angle changes its sign too."""
+    turned = [-value if sign < 0 else value for value, sign in zip(zero or (), signs.position, strict=False)]
+    if turned == list(zero or ()):
+        return "Correct this in the file."
+    said = ", ".join(f"{value:.6g}" for value in turned)
+    return f"Correct this in the file, and set in [columns] of --config ARM.toml: zero = [{said}]."
 
 
 def refuse_stuck(recordings: Sequence[Recording], source: str, segment: float) -> None:

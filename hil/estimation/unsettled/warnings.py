@@ -74,7 +74,7 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
     return [
         f"{subject.capitalize()} {seem} to be reversed: with {changed} changed, "
         f"{unexplained(suspicion.residual, suspicion.residual_given)}{negative}. Correct this in "
-        "the file, or swap the columns."
+        "the file."
     ]
 
 

@@ -44,7 +44,8 @@ def test_right_signs_raise_no_suspicion(recording: Recording) -> None:
 
 
 @pytest.mark.parametrize(
-    ("torque", "position"), [((1, -1), (1, 1)), ((-1, 1), (1, 1)), ((-1, -1), (1, 1)), ((1, 1), (1, -1))]
+    ("torque", "position"),
+    [((1, -1), (1, 1)), ((-1, 1), (1, 1)), ((-1, -1), (1, 1)), ((1, 1), (1, -1)), ((1, 1), (-1, 1))],
 )
 def test_a_reversed_column_is_named(recording: Recording, torque: tuple[int, int], position: tuple[int, int]) -> None:
     suspicion = suspect_signs([turned(recording, torque, position)])
@@ -134,3 +135,10 @@ def test_an_origin_that_is_half_a_turn_off_is_found_from_the_sign_of_gravity(tur
         return
     assert zeros is not None
     np.testing.assert_allclose(np.cos(zeros + turned), 1.0, atol=1e-12)
+
+
+def test_the_zero_of_a_reversed_angle_changes_its_sign(recording: Recording) -> None:
+    with pytest.raises(CsvError, match=r"the position of joint 1 is reversed.* zero = \[-0\.3, 0\.2\]\.$"):
+        refuse_slips([turned(recording, (1, 1), (-1, 1))], "arm.csv", (0.3, 0.2))
+    with pytest.raises(CsvError, match=r"the signs of both torques are reversed.* Correct this in the file\.$"):
+        refuse_slips([turned(recording, (-1, -1), (1, 1))], "arm.csv", (0.3, 0.2))
