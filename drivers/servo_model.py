@@ -55,8 +55,8 @@ two readings.
 """
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
-"""The first value is a fraction of the goal: if the current is lower, torque may simply be off. In that case, the second
-value replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
+"""The first value is a fraction of the goal: if the current is lower, torque may simply be off. In that case, the
+second value replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
 """
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)

@@ -1,1 +1,1 @@
-"""Torque of the servos: switched on with armed watchdogs, and off with read-back."""
+"""Switching the servos' torque on, with armed watchdogs, and off, with read-back."""

@@ -8,8 +8,8 @@ before torque is cut, torque off is sent three times, since a packet may be lost
 the silence, all servos not yet confirmed are polled again, several times.
 
 Ctrl-C raises KeyboardInterrupt at any point of the program, even between two servos while torque is being cut. A
-program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
-signals back while torque is cut.
+program that uses the driver as a library may not have signal handlers that merely set a flag, so the driver itself
+holds signals back while torque is cut.
 """
 
 import signal
@@ -34,7 +34,7 @@ _INTERRUPTS_BORNE = 5
 """Number of attempts interrupted by Ctrl-C after which cutting a servo's torque counts as failed."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
-"""Maximum delay of a watchdog beyond its timeout [s], since it counts in steps of 20 ms."""
+"""Longest time beyond its timeout after which a watchdog trips [s]; it counts in steps of 20 ms."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
 """Number of further torque-off packets and the time between them [s]: a packet that collides with a reply is lost."""
@@ -44,7 +44,7 @@ _REPEATS, _REPEAT_S = 2, 0.001
 class TorqueOff:
     """Result of an attempt to cut torque.
 
-    confirmed: joints whose servos were read back as off.
+    confirmed: joints whose servos' torque was read back as off.
     unconfirmed: the other joints, each with the reason.
     unwatched: confirmed or unconfirmed joints whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
@@ -168,7 +168,8 @@ def cut_torque(
     watchdog: float,
     interrupts: list[BaseException],
 ) -> tuple[tuple[Joint, ...], tuple[tuple[Joint, str], ...]]:
-    """Cut torque on all servos and read it back. Returns the confirmed joints, and the others, each with the reason.
+    """Cut torque on all servos and read it back. Return the confirmed joints, and the others, each with the reason why
+    it is not confirmed.
 
     silent: servos that did not answer the last exchange.
     watchdog: timeout of the servos' Bus Watchdogs [s].
@@ -201,7 +202,7 @@ def cut_torque(
         if failed is not None and not lost:
             if isinstance(failed, NoReply):
                 break
-            tell()  # a damaged reply shows that it receives, so its watchdog is not what stops it
+            tell()  # a damaged reply shows that the servo still receives packets, so its watchdog will not stop it
     if left and not lost:
         wait(watchdog + TRIP_S)
         tell()

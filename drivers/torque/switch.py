@@ -24,7 +24,7 @@ from hil.drivers.torque.off import (
 )
 
 WATCH_S = 0.1
-"""Interval at which Torque Enable is read while the arm must be without torque [s]."""
+"""Interval at which Torque Enable is read while torque must stay off [s]."""
 
 
 class TorqueSwitch:
@@ -55,9 +55,9 @@ class TorqueSwitch:
         return set()
 
     def refuse_switched_on(self) -> None:
-        """Check that torque is still off after this program has found it off or switched it off.
+        """Check that torque is still off, after this program has found it off or switched it off.
 
-        If it is on, another program has switched it on; torque is then cut on all servos. Raises BusShared or
+        If it is on, another program has switched it on; this method then cuts torque on all servos. Raises BusShared or
         TorqueNotOff.
         """
         if not (found := switched_on(self._servos)):
