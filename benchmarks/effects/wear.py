@@ -80,7 +80,7 @@ def identify_all(config: Config, runs: int, other_motion: bool, folder: Path) ->
 
 
 def _identify(config: Config, changed: str, seed: int, other_motion: bool, folder: Path, path: Path) -> int:
-    """Identify with this seed or, if the motion exceeds the limits, with the next suitable one; return the seed used."""
+    """Identify with this seed or, if its motion exceeds limits, with the next suitable one; return the seed used."""
     for tried in range(seed, seed + 20):
         try:
             hil.identify(arm_after(config, changed, tried, other_motion, folder), out=path)

@@ -41,7 +41,8 @@ _NO_DASK = "hil study needs Dask: pip install 'hil[study]'."
 _CONNECT_S = 10.0
 _MOST_DEATHS = 10
 """Number of worker losses after which a run counts as failed, since a run that needs too much memory kills every worker
-that tries it."""
+that attempts it.
+"""
 
 
 @contextmanager
@@ -148,7 +149,7 @@ def _package_versions() -> dict[str, str]:
 
 
 def _check_versions(client: "Client", scheduler: str | None) -> None:
-    """Refuse workers with other package versions, which would give different numbers."""
+    """Refuse workers with other package versions, since their results could differ."""
     try:
         client.wait_for_workers(1, timeout=600 if scheduler == "slurm" else 60)
     except TimeoutError as error:

@@ -166,7 +166,7 @@ class Study(_Table):
 
 
 def load_study(path: Path) -> Study:
-    """Read and check the file. Raises ConfigError; its message names the file, the key, the value and the allowed values."""
+    """Read and check the file. Raises ConfigError; its message gives the file, key, value and allowed values."""
     try:
         values = load_toml(path)
     except TomlFileError as error:

@@ -1,4 +1,4 @@
-"""Instructions to one servo, and their broadcasts to all servos."""
+"""Instructions to one servo, and the same instructions broadcast to all servos."""
 
 from benchmarks.bus import codec
 from benchmarks.bus.codec import BROADCAST, Status, packet
