@@ -88,7 +88,7 @@ def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
     """The complete work of an experiment for one sample: exchange in SI units, recorder, guard, and the model watch,
     which supports up to two joints.
 
-    The simulated arm hangs still, since the currents are too small to move it, so the guard has nothing to stop.
+    The simulated arm hangs at rest, since the currents are too small to move it, so the guard has nothing to stop.
     """
     from hil.experiment.guard import Guard
     from hil.experiment.model_watch import ModelWatch

@@ -344,9 +344,10 @@ class ServoBus(TorqueSwitch):
 
     @property
     def watchdog_changed(self) -> tuple[int, int] | None:
-        """Index of a joint whose Bus Watchdog had changed when last read back, and its value [20 ms]; otherwise None.
+        """Index of a joint whose Bus Watchdog had changed when last read back, and its value [20 ms]; None if there is
+        none.
 
-        Tripping does not count as a change; what caused it depends on how long no packets had been sent.
+        Tripping does not count as a change, since a pause between this program's packets can also cause it.
         """
         expected = self.armed_ticks, WATCHDOG_TRIPPED
         for place, ticks in self.prepared.watchdogs:

@@ -31,15 +31,15 @@ OVERRUN_S = 1e-3
 """A reply delivered more than this long after it was due counts as a real-time overrun [s]."""
 
 TOO_SLOW_S = 5e-3
-"""By how much the computing time of a turn of the server's loop may exceed the simulated time [s]. If this is exceeded
-twice in a row, the server leaves the excess time unsimulated.
+"""Largest acceptable excess of computing time over simulated time in one pass of the server's loop [s]. If two
+consecutive passes exceed it, the time beyond it is not simulated.
 """
 
 LONGEST_SLEEP_S = 0.05
 """Longest wait before the server checks for faults, watchdog trips and a request to stop [s]."""
 
 MOST_AHEAD_S = 0.02
-"""Largest wire time of the bytes that the server takes from the terminal before they are due [s].
+"""How far ahead of time the server may take bytes from the terminal, measured as their wire time [s].
 
 Further bytes wait in the terminal; once it is full, a host that continues to write blocks, as with a real adapter.
 """

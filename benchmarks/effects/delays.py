@@ -83,7 +83,7 @@ def drawn_arm(random: np.random.Generator) -> Arm:
 
 
 def drawn_torque(random: np.random.Generator, arm: Arm, rate: int) -> Array:
-    """For each joint, ten sines from 0.15 to 4 Hz, with a peak of about the torque of gravity (2, samples) [N m]."""
+    """For each joint, ten sines from 0.15 to 4 Hz, with a peak of about the gravity torque (2, samples) [N m]."""
     time_s = np.arange(round(SECONDS[rate] * rate)) / rate
     truth = arm.truth()
     found = []

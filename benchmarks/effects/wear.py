@@ -68,7 +68,9 @@ def main() -> None:
 
 
 def identify_all(config: Config, runs: int, other_motion: bool, folder: Path) -> Iterator[Identified]:
-    """Identify the unchanged arm `runs` times, and every changed one twice. config: with a [fake] arm of two joints."""
+    """Identify the unchanged arm `runs` times, and every changed one twice. config: describes a [fake] arm of two
+    joints.
+    """
     seed = 0
     wanted = [""] * runs + [f"{term}_{joint}" for term in TERMS for joint in (1, 2) for _ in range(2)]
     for changed in wanted:

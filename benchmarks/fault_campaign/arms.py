@@ -102,7 +102,7 @@ def _load(name: str) -> dict[str, Any]:
 
 
 def _fake_arm(document: dict[str, Any]) -> dict[str, Any]:
-    """A fake arm for a configuration of real servos: the donor's arm, scaled to the configured torques."""
+    """A fake arm for a configuration of real servos: the fake arm of `_DONOR`, scaled to the configured torques."""
     arm = _load(_DONOR)["fake"]["arm"]
     share = document["experiment"]["peak_torque"][0] / _DONOR_TORQUE
     for link in arm["links"]:

@@ -238,10 +238,10 @@ def acts_at(attack: Attack, attacks: Sequence[Attack]) -> float:
 
 
 def since_again(driven: NDArray[np.float64], since: float, again: list[float]) -> float:
-    """When the current had to end [s] if another program switched torque on again, at the times `again`.
+    """Time at which the current had to end [s] if another program switched torque on again, at the times `again`.
 
-    driven: times at which current flowed [s]. The time limit restarts at such a time if the current had ended in time
-    after `since`, had been off for `LASTING_MS` (longer than goals take to pass through zero), and then flows again.
+    driven: times at which current flowed [s]. The time limit restarts at such a time if the current ended in time after
+    `since`, was off for `LASTING_MS` (longer than goals take to pass through zero), and then flows again.
     """
     for when in sorted(again):
         begins = when - 1e-3 * UNSURE_MS
@@ -389,7 +389,7 @@ def overruled_ms(config: Config, story: Story, told: "Told") -> float:
 
 
 def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int, gap_ms: int) -> Reason | None:
-    """When [s] a failure began that lasted at least `hold_ms`, including interruptions of up to `gap_ms`."""
+    """Time [s] at which a failure began that lasted at least `hold_ms`, including interruptions of up to `gap_ms`."""
     at = np.flatnonzero(wrong)
     if not at.size:
         return None

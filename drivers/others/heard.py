@@ -47,7 +47,7 @@ class Heard:
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """Number of replies since the last late one that contain one answer per servo but not the requested IDs."""
+        """Number of replies, since the last late reply, that contain one answer per servo but not the requested IDs."""
         self.strangers: float = 0
         """Number of received packets that another master sent or requested."""
 
@@ -91,7 +91,7 @@ class Heard:
             self.strangers += sum(self._is_anothers(*front) for front in _fronts_of_instructions(received))
 
     def continued(self, before: bytes, received: bytes, now: float) -> None:
-        """Examine bytes that may be the rest of a reply that was incomplete when time was up.
+        """Examine bytes that may be the rest of a reply that was incomplete when its timeout expired.
 
         before: the bytes that had been received by then.
         """

@@ -184,7 +184,7 @@ class ReadBack:
         self.longest = max(_FADES * self.longest, seconds)
 
     def postponed(self, now: float) -> None:
-        """Record the fact that a cycle left no time for a read-back."""
+        """Record that a cycle left no time for a read-back."""
         self.overdue_at = min(self.overdue_at, now + OVERDUE_S)
 
     def delayed(self, now: float, delay: float, *, alone: bool) -> None:

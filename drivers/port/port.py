@@ -110,8 +110,8 @@ class Port:
     def ask(self, data: bytes, count: int, expected: ReplyTime, start: float) -> bytes:
         """Write at `start` [s, on the port's clock], then read until the timeout, as the control cycle does.
 
-        Pending input is set aside first: otherwise a late reply would be taken for the reply to this request, and every
-        later one would be a cycle late.
+        Pending input is set aside first: otherwise, a late reply would be taken for the reply to this request, and
+        every later reply would be used one cycle late.
         """
         if self.has_input():
             self.put_aside()

@@ -1,4 +1,4 @@
-"""Choice of the number of exchanges per sample and per status read, which the time on the wire limits."""
+"""Chooses how many exchanges are made per sample and per status read; the time on the wire limits both."""
 
 import math
 from collections.abc import Sequence

@@ -1,1 +1,1 @@
-"""Switching the servos' torque on, with armed watchdogs, and off, with read-back."""
+"""Switches the servos' torque on with armed watchdogs, and off with read-back."""

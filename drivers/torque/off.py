@@ -34,7 +34,7 @@ _INTERRUPTS_BORNE = 5
 """Number of attempts interrupted by Ctrl-C after which cutting a servo's torque counts as failed."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
-"""Longest time beyond its timeout after which a watchdog trips [s]; it counts in steps of 20 ms."""
+"""How long after its timeout a watchdog may trip [s], since it counts in steps of 20 ms."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
 """Number of further torque-off packets and the time between them [s]: a packet that collides with a reply is lost."""
@@ -51,7 +51,7 @@ class TorqueOff:
     rebooted: confirmed joints whose servos were reset, which disarmed the watchdog armed before torque was switched on.
     disarmed: confirmed joints whose servos were not reset, but whose watchdog another program switched off.
     tripped: joints whose Bus Watchdog may have tripped, which zeroes their goals; it has been cleared since.
-    driven: the remaining joints, because another program switches their servos' torque on whenever it is cut.
+    driven: the remaining joints; another program switches their servos' torque on whenever it is cut.
     """
 
     confirmed: tuple[Joint, ...]
@@ -69,7 +69,7 @@ class TorqueOff:
         return not self.unconfirmed and not self.driven
 
     def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
-        """Return the report after another program has switched torque on again.
+        """Return the report, updated because another program has switched torque on again.
 
         on: joints whose servos' torque is on again each time it is cut. silent: joints whose servos have not
         answered since.
@@ -83,12 +83,13 @@ class TorqueOff:
         )
 
     def with_doubted(self, joint: Joint, why: str) -> "TorqueOff":
-        """Return the report with a joint no longer confirmed, although its servo reads back as off."""
+        """Return the report with a joint no longer confirmed, although its servo's torque reads back as off."""
         confirmed = tuple(each for each in self.confirmed if each != joint)
         return replace(self, confirmed=confirmed, unconfirmed=(*self.unconfirmed, (joint, why)))
 
     def with_later(self, joint: Joint, *, rebooted: bool | None) -> "TorqueOff":
-        """Return the report with a joint now confirmed, since its servo has answered again and reads back as off.
+        """Return the report with a joint now confirmed, since its servo has answered again and its torque reads back as
+        off.
 
         rebooted: result of `was_rebooted`.
         """
@@ -244,7 +245,8 @@ def _tell(port: Port, servos: Mapping[Joint, Servo], register: str, value: int, 
 def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> frozenset[Joint]:
     """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more.
 
-    Return the joints whose watchdog has tripped or may have tripped; once it is off, this can no longer be read.
+    Return the joints whose watchdog has tripped or may have tripped; once a watchdog is off, this can no longer be
+    read.
     """
     tripped = set(servos)
 

@@ -162,7 +162,8 @@ class TorqueSwitch:
         return self.torque_off_report
 
     def shorten_watchdogs(self, seconds: float) -> None:
-        """Shorten the timeouts of the armed Bus Watchdogs to `seconds` [s] until torque is off; keep shorter timeouts.
+        """Shorten the timeouts of the armed Bus Watchdogs to `seconds` [s] until torque is off; leave shorter timeouts
+        unchanged.
 
         Nothing is read back: a servo that misses the packet keeps its previous timeout.
         """
@@ -188,7 +189,7 @@ class TorqueSwitch:
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
 
     def has_torque(self) -> bool:
-        """Read outside the control cycle whether torque is on at all servos; False if a servo does not answer."""
+        """Return whether torque is on at all servos, read outside the control cycle; False if a servo does not answer."""
         return all(is_torque_on(servo) for servo in self._servos.values())
 
     def cut_foreign_torque(self, on: Collection[Joint]) -> None:

@@ -66,7 +66,7 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
         except (OSError, TimeoutError, ValueError) as error:
             raise ConfigError(
                 f"--scheduler {scheduler}: no Dask scheduler answers there ({type(error).__name__}). Start one with "
-                "`dask scheduler`, workers with `dask worker ADDRESS --nthreads 1`."
+                "`dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`."
             ) from error
         with client:
             _check_versions(client, scheduler)
