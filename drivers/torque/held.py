@@ -93,8 +93,8 @@ def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
 def _lowered(goals: Iterable[tuple[Servo, str, int]]) -> str:
     listed = ", ".join(f"{name} of ID {servo.id}, which was {begun}" for servo, name, begun in goals)
     return (
-        f"The arm was being let down and has been left with a lowered {listed}. Hold the arm by hand, switch its "
-        "torque off and set this again with DYNAMIXEL Wizard 2.0, or start again with --take-over."
+        f"The arm was being lowered slowly and has been left with a reduced {listed}. Hold the arm by hand, switch "
+        "its torque off and set this again with DYNAMIXEL Wizard 2.0, or start again with --take-over."
     )
 
 

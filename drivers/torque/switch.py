@@ -189,7 +189,7 @@ class TorqueSwitch:
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
 
     def has_torque(self) -> bool:
-        """Return whether torque is on at all servos, read outside the control cycle; False if a servo does not answer."""
+        """Read outside the control cycle whether all servos have torque on; False if one does not answer."""
         return all(is_torque_on(servo) for servo in self._servos.values())
 
     def cut_foreign_torque(self, on: Collection[Joint]) -> None:

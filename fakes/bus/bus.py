@@ -102,7 +102,7 @@ class FakeBus:
 
     @property
     def servos(self) -> dict[int, EmulatedServo]:
-        """The servos by current ID, advanced to the clock's current time; if servos share an ID, only the last of them."""
+        """Servos by current ID, advanced to the clock's current time; if several have the same ID, only the last."""
         self.advance(self.clock.now())
         return {servo.id: servo for servo in self._servos}
 
