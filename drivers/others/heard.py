@@ -25,7 +25,7 @@ _LONGEST_CUT_OFF = 64
 _LEAST_REPEATED = 4
 """Minimum length at which a repeated part of a reply is recognised as such [bytes]."""
 
-_PART_OF_A_REPLY = 8  # bytes; anything shorter may lack an answer, as does the header of a fast reply
+_PART_OF_A_REPLY = 8  # bytes that may accompany intact answers in a cut-off reply: a fast reply's header
 
 
 class Heard:
