@@ -6,8 +6,9 @@
  *                                   goal in the last Sync Write of Goal Current), velocity 0, and a position of half a
  *                                   turn, one tick more in every other answer. Other registers return a counter.
  * responder client TTY SERVOS CYCLES WRITES
- *                                   the cheapest possible client in C: the same packets, prepared, in WRITES writes, and
- *                                   one blocking read. Prints nanoseconds: CPU per cycle, median round trip, time per cycle.
+ *                                   the cheapest possible client in C: the same packets, prepared, in WRITES writes,
+ *                                   and one blocking read. Prints nanoseconds: CPU per cycle, median round trip, time
+ *                                   per cycle.
  */
 #define _GNU_SOURCE
 #include <fcntl.h>
