@@ -88,7 +88,7 @@ def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
     """The complete work of an experiment for one sample: exchange in SI units, recorder, guard, and the model watch,
     which supports up to two joints.
 
-    The simulated arm hangs still, since the currents are too small to move it, so the guard has nothing to stop.
+    The simulated arm hangs at rest, since the currents are too small to move it, so the guard has nothing to stop.
     """
     from hil.experiment.guard import Guard
     from hil.experiment.model_watch import ModelWatch
@@ -208,8 +208,8 @@ Rounds = dict[str, list[Round]]
 
 def measure(binary: Path, servos: int, byte_ns: int, rounds: int, count: int) -> Rounds:
     """Run all clients in turn; every round starts with a different one."""
-    # The responder's arm is a tick farther in every other answer, and the guard's sum of work leaves out the motion
-    # between two rounds: with an odd number of cycles what is left out cancels.
+    # The position in the responder's answers alternates by one tick, and the guard's sum of work omits the motion
+    # between two rounds; with an odd number of cycles, the omitted parts cancel.
     count |= 1
     results: Rounds = {}
     with ExitStack() as stack:

@@ -19,7 +19,7 @@ seconds                wall time of both stages on one core, without compilation
 iterations             number of simulations that include all sensitivities
 share_of_classic       ratio of the torque error to that of the classic method on the same recording
 classic                the same figures for filtered inverse-dynamics least squares: the best of three cut-offs, chosen
-                       with the truth known; it has no one-step-ahead residual
+                       by comparison with the truth; it has no one-step-ahead residual
 
 mujoco_sysid           with --peers: torque and base parameter errors of mujoco.sysid on the first seed's recording,
                        its parameters and processor time on all cores, and the ratio of the latter to ours

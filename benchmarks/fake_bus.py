@@ -66,7 +66,7 @@ def streams(config_path: Path, runs: int) -> dict[str, float]:
 
 
 def _shares(config_path: Path) -> dict[str, float]:
-    """Time of bus and plant per cycle, from one more run with clocks around them (which take 0.3 us each)."""
+    """Time of bus and plant per cycle, from one more run in which they are timed (timing a call takes 0.3 us)."""
     config = load_config(config_path)
     spent = {"stream": 0.0, "write": 0.0, "read": 0.0, "plant": 0.0}
     arm_seconds: list[float] = []
@@ -223,7 +223,7 @@ def main() -> None:
     print(machine())
     print(f"stream in virtual time: {figures['cycle_us']:.1f} us per cycle")
     print(f"  {figures['times_real_time']:.0f} times real time")
-    print(f"  of it bus {figures['bus_share_us']:.1f} us, plant {figures['plant_share_us']:.1f} us")
+    print(f"  of which bus {figures['bus_share_us']:.1f} us, plant {figures['plant_share_us']:.1f} us")
     print("bus alone: " + ", ".join(f"{count}: {us:.1f} us" for count, us in figures["servos_us"].items()))
     print(f"pty: {figures['pty_rate']:.0f} cycles/s for {options.seconds:g} s, {figures['pty_wrong']} wrong replies")
     print(f"  {figures['pty_late_cycles']} cycles late by at least one period (including the client's own lateness)")

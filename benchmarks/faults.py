@@ -104,7 +104,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", help="only this bundled configuration")
     parser.add_argument("--rate", type=int, help="only this rate [Hz]")
-    parser.add_argument("--show", action="store_true", help="print every outcome that is not good")
+    parser.add_argument("--show", action="store_true", help="print every outcome with a problem")
     options = parser.parse_args()
     chosen = [each for each in settings() if options.only in (None, each.name) and options.rate in (None, each.rate)]
     outcomes, left_out = campaign(chosen, options.injections, options.jobs, options.first)

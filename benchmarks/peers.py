@@ -11,9 +11,9 @@ estimator/baselines/compare.py and hil/estimation/comparison/mujoco_peer.py; muj
 Times are medians of three runs of each method in one process, after one run for compilation, and exclude building the
 model and residual of mujoco.sysid. On the demo recording, `hil` also fits the Stribeck friction and current lag of the
 configuration, which takes additional time; `hil_coulomb` and mujoco.sysid are limited to Coulomb friction, so neither
-can fit that arm completely. The textbook arm has Coulomb friction, and so have all three models there, so the times are
-for the same work. mujoco.sysid distributes its rollouts over all cores, and hil distributes two or three of its fits,
-so the ratio is meaningful only on an idle machine.
+can fit that arm completely. The textbook arm has Coulomb friction, as do all three models there, so the times are for
+the same work. mujoco.sysid distributes its rollouts over all cores, and hil distributes two or three of its fits, so
+the ratio is meaningful only on an idle machine.
 """
 
 import argparse

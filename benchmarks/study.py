@@ -51,7 +51,7 @@ KILLS = 5
 
 
 def study_file(folder: Path, text: str) -> Path:
-    """Write the study next to an arm with short periods."""
+    """Write the study's file next to the file of an arm with short periods."""
     arm = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
     for old, new in (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]")):
         arm = arm.replace(old, new)
@@ -74,7 +74,7 @@ def rows_of(dataset: Dataset) -> Any:
 
 
 def workers_of(parent: int) -> list[int]:
-    """Process IDs of the Dask workers below `parent`, by decreasing memory size."""
+    """Process IDs of the Dask workers below `parent`, in order of decreasing memory use."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and parent in _ancestors(int(entry.name)):

@@ -98,7 +98,8 @@ class ServoBus(TorqueSwitch):
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
-        """Open the port, check that the expected servos answer and have torque off, and set every servo's mode.
+        """Open the port, check that the expected servos answer and that their torque is off, and set every servo's
+        mode.
 
         Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting or TorqueHeld, after closing the port.
         """
@@ -183,7 +184,7 @@ class ServoBus(TorqueSwitch):
         """Ensure that every servo's torque is off before anything is written.
 
         If it is not, raises TorqueHeld, or lets the arm sink if `BusConfig.take_over` is set.
-        ours: joints whose torque was left on by an earlier program of this user; that torque is cut immediately.
+        ours: joints whose torque was left on by a program that this user ran earlier; that torque is cut immediately.
         """
         for joint in ours:
             if self._servos[joint].read("Torque Enable"):
@@ -193,7 +194,7 @@ class ServoBus(TorqueSwitch):
         refuse_held(self._servos)
         for servo in self._servos.values():
             if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED and servo.read("Torque Enable"):
-                servo.write("Torque Enable", 0)  # any torque from now on is another program's
+                servo.write("Torque Enable", 0)  # if torque is on after this, another program has switched it on
 
     def prepare(self) -> None:
         """Set every servo's mode with torque off, and prepare the exchange.
@@ -223,7 +224,7 @@ class ServoBus(TorqueSwitch):
         self._exchange = exchange
 
     def add_read_back(self, exchange: ReadBackExchange) -> None:
-        """Make `exchange` read back the servos' goals, Torque Enable, and the settings, which must not change."""
+        """Make `exchange` read back the servos' goals, Torque Enable, and the settings that must not change."""
         modes = [drive.mode for drive in self._drives]
         settings = [[servo.read(name) for name in SETTINGS] for servo in self._servos.values()]
         exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in self._servos.values()]), settings)
@@ -322,8 +323,8 @@ class ServoBus(TorqueSwitch):
     def first_hides_others(self, patience: float) -> bool:
         """Return whether the first servo is silent although the last one replies. Raises PortLost.
 
-        In a group read, a silent servo prevents the replies of all servos listed after it. The last servo is
-        therefore read before the first. patience: how long to wait for the replies [s].
+        In a group read, a silent servo prevents all servos listed after it from replying. This method therefore
+        reads the last servo before the first. patience: how long to wait for the replies [s].
         """
         drives = (self._drives[-1], self._drives[0])
         read = SyncRead([each.id for each in drives], Span.of([self._servos[each].table for each in drives], ["ID"]))
@@ -343,9 +344,10 @@ class ServoBus(TorqueSwitch):
 
     @property
     def watchdog_changed(self) -> tuple[int, int] | None:
-        """Index of a joint whose Bus Watchdog had changed when last read back, and its value [20 ms]; otherwise None.
+        """Index of a joint whose Bus Watchdog had changed when last read back, and its value [20 ms]; None if there is
+        none.
 
-        Tripping does not count as a change: its cause depends on how long no packets were sent.
+        Tripping does not count as a change, since a pause between this program's packets can also cause it.
         """
         expected = self.armed_ticks, WATCHDOG_TRIPPED
         for place, ticks in self.prepared.watchdogs:
@@ -366,8 +368,8 @@ class ServoBus(TorqueSwitch):
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """Index of a joint that has missed many of the latest goals, and text about the value read back; None if no
-        joint has.
+        """Index of a joint that has missed many of the latest goals, and a description of the value read back; None if
+        there is no such joint.
         """
         if (lost := self.prepared.lost) is None:
             return None

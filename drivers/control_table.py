@@ -82,7 +82,7 @@ def _folder() -> Path:
 
 
 def _what_is_installed() -> str:
-    """Say why there are no control tables, and what to do."""
+    """Return the reason why there are no control tables, and the remedy."""
     needed = "hil reads the servos' control tables from the package dynamixel-sdk, version 4.1 or newer"
     try:
         installed = version("dynamixel-sdk")

@@ -28,7 +28,7 @@ from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRea
 from hil.drivers.turns import NEVER, Turns
 
 HOST_S = 0.75e-3
-"""Time allowed for the computer itself, including USB frames [s]; added to the times of wire, servos and adapter."""
+"""Time allowed for the computer itself, including USB frames [s], in addition to wire, servos and adapter."""
 
 PATIENCE_SHARE = 0.5
 """Minimum reply timeout as a fraction of the time between two cycles."""
@@ -79,7 +79,8 @@ class Exchange:
     slow_every: number of cycles between two reads of a slow span, i.e. one of `spans[1:]`.
     status_every: number of cycles between two status reads; there are none if `status` is None.
     interval: time between two cycles [s], 0 if unknown; the longer it is, the longer a cycle can wait for a reply.
-    patience: minimum time to wait for replies [s]; by default the longest time that wire, servos and adapter may need.
+    patience: minimum time to wait for replies [s]; by default the longest time that the wire, the servos and the
+    adapter may need.
     beside: registers that are read back between cycles; a late reply to such a read is also recognised by its length.
     """
 
@@ -325,7 +326,7 @@ class Exchange:
         if not self._echoes:
             return received
         if len(received) == read.reply_size and read.unpack(received) is not None:
-            self._echoes = False  # an adapter that no longer echoes: waiting for it would make every cycle late
+            self._echoes = False  # the adapter no longer echoes; waiting for an echo would make every cycle late
             self._is_plain = self.one_write
         return received.removeprefix(sent)
 

@@ -83,8 +83,8 @@ class Joint:
     def within_turn(self, position_ticks: int) -> "Joint":
         """Return this joint with its zero shifted by whole turns, so that its angle is closest to `near`.
 
-        Without `near`, the joint is returned unchanged. At power-up, a servo starts within one turn; if the joint rests
-        just beyond the end of that turn, its angle is off by a whole turn.
+        Without `near`, the joint is returned unchanged. After power-up, a servo reports its position within a single
+        turn; if the joint rests just beyond the end of that turn, its angle is off by a whole turn.
         """
         if self.near is None:
             return self

@@ -74,7 +74,9 @@ class HardwareError(IntFlag):
 
 
 class Packet(NamedTuple):
-    """One packet without its stuffing. `body` is everything between INST and CRC; in a status, it begins with ERR."""
+    """One packet without its stuffing. `body` is everything between INST and CRC; in a status packet, it begins with
+    ERR.
+    """
 
     id: int
     instruction: int

@@ -25,7 +25,7 @@ _tick = partial(tuple.__new__, Tick)  # half the time of Tick(...)
 
 
 class FixedRate:
-    """Deadlines at `rate` per second; the first is one interval after the first call of `wait`.
+    """Deadlines that occur `rate` times per second, beginning one interval after the first call of `wait`.
 
     After a stall, each missed deadline is returned without waiting, marked as missed and counted in `missed`.
     """

@@ -159,12 +159,12 @@ class ReadBackExchange(Exchange):
         if before + takes > end:  # woken up late
             self.read_back_at = before + TRY_AGAIN_S
             return None
-        # Where there is hardly enough time, a reply that comes a little late is not lost.
+        # Even if there is barely enough time, a slightly late reply is still accepted.
         servos = self._ask_back(read, before, max(end - before, takes + _LATE_SHARE * self._overtime))
         now = self._now()
         if now > due:
             self.awaited_until = now
-        # Where nothing at all arrived, the reply may be late, and another one would be mistaken for it.
+        # If nothing at all arrived, the reply may be late and would be mistaken for the reply to a repeated read.
         if None in servos and self.heard.latest and back.may_repeat(now, takes):
             # The packet of another master may have destroyed the reply, and the next cycle overwrites what it wrote.
             self.awaited_until = now + takes + self._wire_s[read]

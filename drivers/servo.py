@@ -127,14 +127,16 @@ class Servo:
         """Write a register and read it back. Raises the errors of `read`, and ServoRefused if it reads back as a
         different value.
 
-        attempts: maximum number of attempts at the write, and then at the read; by default, as for all set-up work.
+        attempts: maximum number of attempts at the write, and then at the read; by default, the number used for all
+        set-up work.
         """
         self._write_and_read_back(register, value, attempts, despite_error=False)
 
     def write_despite_error(self, register: str, value: int) -> None:
         """Write a register like `write`, but ignore errors reported in replies if the value reads back as written.
 
-        Writes that make an arm safe or restore it must not fail because a servo reports errors but obeys.
+        A write that makes an arm safe or restores it must not fail just because a servo that obeys also reports an
+        error.
         """
         self._write_and_read_back(register, value, None, despite_error=True)
 

@@ -30,11 +30,11 @@ __all__ = ["DescriptionError", "FakeArm", "FakeServo", "beside", "found_beside",
 
 
 class DescriptionError(ValueError):
-    """The [fake] table is unreadable or invalid. The message names the file, the key, the value and what is allowed."""
+    """The [fake] table is unreadable or invalid. The message gives the file, key, value and allowed values."""
 
 
 _KEYS_OF_REGISTERS = {"ID": "id", "Baud Rate": "baud", "Return Delay Time": "return_delay_us"}
-"""Keys of a servo that set an EEPROM register, by the register's name."""
+"""Keys of a servo's table that set EEPROM registers, by the registers' names."""
 
 
 def _listed(values: Sequence[int]) -> str:
@@ -224,8 +224,8 @@ def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def found_beside(folder: Path, name: str) -> Path:
-    """Return the path of the file `name`, which is relative to `folder`; if there is none, that of a file of the same
-    base name in `folder` itself, if it exists.
+    """Return the path of the file `name`, relative to `folder`. If there is no such file, but `folder` itself contains
+    a file with the same base name, return the path of that file.
     """
     named, beside = folder / name, folder / Path(name).name
     return beside if beside.is_file() and not named.is_file() else named

@@ -31,15 +31,15 @@ OVERRUN_S = 1e-3
 """A reply delivered more than this long after it was due counts as a real-time overrun [s]."""
 
 TOO_SLOW_S = 5e-3
-"""Tolerated excess of computing time over simulated time [s]. If it is exceeded twice in a row, the server skips the
-time beyond it.
+"""Largest acceptable excess of computing time over simulated time in one pass of the server's loop [s]. If two
+consecutive passes exceed it, the time beyond it is not simulated.
 """
 
 LONGEST_SLEEP_S = 0.05
 """Longest wait before the server checks for faults, watchdog trips and a request to stop [s]."""
 
 MOST_AHEAD_S = 0.02
-"""Largest wire time of the bytes that the server takes from the terminal before they are due [s].
+"""How far ahead of time the server may take bytes from the terminal, measured as their wire time [s].
 
 Further bytes wait in the terminal; once it is full, a host that continues to write blocks, as with a real adapter.
 """
@@ -86,10 +86,9 @@ class Counts(NamedTuple):
 class PtyServer:
     """Serves one fake arm on a pseudo-terminal; `serve` runs until `stop` is called from a thread or signal handler.
 
-    link: symbolic link to create for the terminal. A link that a killed server left is replaced; LinkError is raised if
-    anything else is at that path, or if a running server uses the link.
-    `bus` may be inspected, and its hand moved, from another thread that holds `lock`; from another process, `hil
-    hand` moves it.
+    link: symbolic link to create for the terminal. A link left behind by a killed server is replaced; LinkError is
+    raised if anything else is at that path, or if a running server uses the link. `bus` may be inspected, and its hand
+    moved, from another thread that holds `lock`; from another process, `hil hand` moves it.
     """
 
     def __init__(self, description: FakeArm, link: Path | None = None) -> None:
@@ -130,7 +129,7 @@ class PtyServer:
         """Serve until stopped. `watch` is called periodically with the statistics."""
         _wake_up_in_time()
         gc.collect()
-        gc.freeze()  # otherwise a full collection scans everything imported, for 10 ms or more
+        gc.freeze()  # otherwise, a full garbage collection scans everything imported, for 10 ms or more
         now = self._clock.now
         next_watch = now() + watch_every_s
         behind = 0.0
@@ -247,7 +246,8 @@ class PtyServer:
 
 
 def _claim(link: Path) -> socket.socket:
-    """Claim a link until the socket is closed or the process dies, and remove the link if a killed server left it.
+    """Claim a link until the socket is closed or the process dies, and remove the link if a killed server left it
+    behind.
 
     The claim is an abstract Unix socket, which the system then frees. Raises LinkError if the link cannot be used.
     """

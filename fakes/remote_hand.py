@@ -18,7 +18,7 @@ _PATIENCE_S = 5.0
 
 
 class NoHand(OSError):
-    """No fake arm is served on this terminal. The message names the terminal and the remedy."""
+    """No fake arm is served on this terminal. The message gives the terminal and the remedy."""
 
 
 def socket_path(terminal: str) -> Path:

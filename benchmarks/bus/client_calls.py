@@ -29,7 +29,7 @@ def anything(_: Any) -> bool:
 
 
 def dynamixel_sdk(device: str) -> Iterator[Call]:
-    """Calls of dynamixel-sdk on fake_two_link: two XM430-W350, IDs 1 and 2."""
+    """Calls made with dynamixel-sdk to fake_two_link: two XM430-W350, IDs 1 and 2."""
     import dynamixel_sdk as sdk
 
     port, handler = sdk.PortHandler(device), sdk.PacketHandler(2.0)
@@ -67,7 +67,7 @@ def dynamixel_sdk(device: str) -> Iterator[Call]:
 
 
 def dynamixel_easy_sdk(device: str) -> Iterator[Call]:
-    """Calls of dynamixel_easy_sdk on koch: XL430-W250 and XL330-M288."""
+    """Calls made with dynamixel_easy_sdk to koch: XL430-W250 and XL330-M288."""
     from dynamixel_easy_sdk.connector import Connector
     from dynamixel_easy_sdk.data_types import OperatingMode
 
@@ -143,7 +143,7 @@ def rustypot(device: str) -> Iterator[Call]:
 
 
 def dxl2(device: str) -> Iterator[Call]:
-    """Calls of dynamixel-python on fake_two_link."""
+    """Calls made with dynamixel-python to fake_two_link."""
     library = importlib.import_module("dxl2")
     bus = library.v2.MotorBus(device, BAUD, timeout=0.3)
     yield "connect", bus.connect, anything
@@ -193,7 +193,7 @@ def pypot(device: str) -> Iterator[Call]:
 
 
 def lerobot_bus(device: str) -> Iterator[Call]:
-    """Calls of LeRobot's DynamixelMotorsBus on koch."""
+    """Calls made with LeRobot's DynamixelMotorsBus to koch."""
     from lerobot.motors import Motor, MotorNormMode
     from lerobot.motors.dynamixel import DynamixelMotorsBus
 
@@ -230,7 +230,7 @@ def lerobot_bus(device: str) -> Iterator[Call]:
 
 
 def lerobot_koch(device: str) -> Iterator[Call]:
-    """Calls of LeRobot's unmodified KochFollower on koch; `hil hand` stands in for the person."""
+    """Calls made with LeRobot's unmodified KochFollower to koch; `hil hand` stands in for the person."""
     import tempfile
     from pathlib import Path
 
@@ -284,7 +284,7 @@ def lerobot_koch(device: str) -> Iterator[Call]:
 
 
 def lerobot_shadows(device: str) -> Iterator[Call]:
-    """Calls of LeRobot on viperx_300: the arm of ALOHA, whose shadow servos obey commands to their Secondary ID."""
+    """Calls made with LeRobot to viperx_300, ALOHA's arm, whose shadow servos obey commands to their Secondary ID."""
     from lerobot.motors import Motor, MotorNormMode
     from lerobot.motors.dynamixel import DynamixelMotorsBus
 
@@ -351,7 +351,7 @@ def _be_patient() -> None:
 
 
 def _wrong(act: Callable[[], Any], wanted: Any) -> str:
-    """Describe what is wrong with a call's result; empty if it is correct."""
+    """Return a description of what is wrong with a call's result; "" if it is correct."""
     try:
         got = act()
         right = wanted(got) if callable(wanted) else got == wanted

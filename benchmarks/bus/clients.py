@@ -1,7 +1,7 @@
-"""Independent clients on the fake bus over a pseudo-terminal, with the result of every call.
+"""Run independent clients on the fake bus over a pseudo-terminal, and check the result of every call.
 
     python benchmarks/bus/clients.py                                    the clients installed in this environment
-    python benchmarks/bus/clients.py --python /path/to/venv/bin/python  also those of that one (LeRobot needs its own)
+    python benchmarks/bus/clients.py --python /path/to/venv/bin/python  also the clients in that environment (LeRobot)
     python benchmarks/bus/clients.py --write                            update the table in docs/fake-bus.md
     python benchmarks/bus/clients.py --json                             one JSON object, with every call
 

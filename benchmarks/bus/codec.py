@@ -77,7 +77,7 @@ def fast_parts(received: bytes, sizes: list[int], answering: int) -> list[Status
     """
     if not answering:
         if received:
-            raise Wrong(f"an answer that nobody can have given: {received.hex(' ')}")
+            raise Wrong(f"an answer that no servo can give: {received.hex(' ')}")
         return []
     length = 1 + sum(size + 4 for size in sizes)
     if received[:8] != HEADER + bytes((BROADCAST,)) + length.to_bytes(2, "little") + bytes((STATUS,)):

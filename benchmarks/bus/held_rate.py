@@ -3,16 +3,16 @@
     python benchmarks/bus/held_rate.py [--seconds 20] [--rounds 3] [--fast | --plain] [--json]
 
 The arm is held at rest with torque on while the program does the same work as during an experiment: deadlines,
-read-backs, exchanges with slow reads and status reads, checks, and recording. The servos run in another process,
-`hil fake --pty`, which delays each byte as the wire would. Both processes ask for real-time scheduling, each on its own
-core. However, the kernel forwards the bytes of a pty in a thread of ordinary priority, and virtual machines
-stall, so run this on a quiet machine only. The load is printed. After each round, two loops with the same deadlines and
-real-time settings show how many deadlines are missed because of the computer and the pty alone. The first loop only
+read-backs, exchanges with slow reads and status reads, checks, and recording. The servos run in another process, `hil
+fake --pty`, which delays each byte as the wire would. Both processes ask for real-time scheduling, each on its own
+core. However, the kernel forwards the bytes of a pty in a thread of ordinary priority, and virtual machines stall, so
+run this on a quiet machine only. The computer's load is printed. After each round, two loops with the same deadlines
+and real-time settings show how many deadlines are missed because of the computer and the pty alone. The first loop only
 waits. The second writes the bytes of an exchange and reads the reply from a responder in C, which delays each byte as
 the wire would; it has no driver, checks, slow reads or read-backs.
 
-missed: number of missed deadlines. slow: number of those that follow an exchange that took more than 1 ms longer than
-the wire needs, so that the computer or the pty caused the miss. lost: number of samples in which a reply is missing.
+missed: number of missed deadlines. slow: number of those caused by the computer or the pty, because the preceding
+exchange took over 1 ms longer than the wire needs. lost: number of samples in which a reply is missing.
 late: 99 % quantile and maximum of the time from a deadline to the write [ms]. took: median, 99 % quantile and maximum
 of the round trip [ms]. work: median time from a reply to the next wait, which is spent on recording and checks [us].
 """

@@ -88,13 +88,13 @@ class Client:
         return answer
 
     def compare(self, what: str, got: Any, allowed: bool) -> None:
-        """Record a difference."""
+        """Record a difference unless this answer is allowed."""
         self.calls[what.split(" ", maxsplit=1)[0]] += 1
         if not allowed:
             self.differences.append(f"{sum(self.calls.values())}: {what}: {got}")
 
     def look(self, servo_id: int, row: Row) -> None:
-        """Read one register and compare it with what it should hold."""
+        """Read one register and compare its value with the expected one."""
         data, result, error = self.ask(lambda: self.handler.readTxRx(self.port, servo_id, row.address, row.size))
         self._told(servo_id, row, data, (result, error), "read")
 

@@ -1,13 +1,14 @@
 /* The two ends of a pty for benchmarks/bus_cycle.py.
  *
  * responder serve FD BYTE_NS        servos: answers Sync Read (82) and Fast Sync Read (8A) on the pty's master side, at
- *                                   once, or after the time that request and reply take on a wire of BYTE_NS a byte.
- *                                   With ten bytes asked for, an arm at rest answers: Present Current (the goal that
- *                                   the last Sync Write of Goal Current had for it), velocity 0, and half a turn, one
- *                                   tick more with every other answer. Other registers are counted up.
+ *                                   once, or after the time that request and reply take on a wire of BYTE_NS per byte.
+ *                                   If ten bytes are requested, an arm at rest answers: Present Current (the servo's
+ *                                   goal in the last Sync Write of Goal Current), velocity 0, and a position of half a
+ *                                   turn, one tick more in every other answer. Other registers return a counter.
  * responder client TTY SERVOS CYCLES WRITES
- *                                   the cheapest client that C allows: the same packets, prepared, in WRITES writes, one
- *                                   blocking read. Prints nanoseconds: CPU per cycle, median round trip, time per cycle.
+ *                                   the cheapest possible client in C: the same packets, prepared, in WRITES writes,
+ *                                   and one blocking read. Prints nanoseconds: CPU per cycle, median round trip, time
+ *                                   per cycle.
  */
 #define _GNU_SOURCE
 #include <fcntl.h>
@@ -62,7 +63,7 @@ static int head(uint8_t *packet, int id, int length) {
 
 static uint8_t goals[256][2];
 
-/* A Sync Write of two bytes: what the motors are told, they carry. */
+/* A Sync Write of two-byte goals: the motors carry the commanded currents. */
 static void listen(const uint8_t *request, int end) {
     if (request[7] != 0x83 || request[10] != 2) return;
     for (int at = 12; at + 3 <= end - 2; at += 3) memcpy(goals[request[at]], request + at + 1, 2);

@@ -164,7 +164,7 @@ FORGOTTEN_WITH_MODE = (*GAINS, 100, 102, 104, 108, 112, 116)
 
 
 class Rules:
-    """What one servo holds according to its manual, derived from the instructions it received.
+    """The register values of one servo according to its manual, derived from the instructions that it received.
 
     table: its control table. values: what its registers hold now, by address.
     """
@@ -196,7 +196,7 @@ class Rules:
             self._forget((100, 102, 104, 116))
         limit = None if row.limit is None else self.held.get(row.limit)
         if row.moves or (row.limit is not None and (limit is None or abs(value) > limit)):
-            # DynamixelSDK issue 173 reports that a goal beyond its limit is taken, issue 588 that it is refused.
+            # DynamixelSDK issue 173 reports that a goal beyond its limit is accepted, issue 588 that it is refused.
             self._forget([address])
             return {FINE, DATA_LIMIT, DATA_RANGE}
         self.held[address] = value

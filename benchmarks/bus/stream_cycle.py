@@ -7,9 +7,9 @@
 `benchmarks/bus_cycle.py` measures exchanges that follow each other without a pause. Here, `hil.experiment.stream` runs
 as in an experiment: it waits for its deadlines (`Pace`), reads goals back before each sample, exchanges, checks and
 records. Each fake bus is `hil fake --pty` in its own process, with the wire time of 1 Mbaud. The other clients write
-goals and read states once per sample, with the same deadlines and real-time settings. All clients sleep until each
-deadline and do not spin before it as an experiment does, so the CPU time is that of the work alone. The clients take
-turns; the ratios are medians over the rounds.
+goals and read states once per sample, with the same deadlines and real-time settings. Unlike an experiment, all clients
+sleep until each deadline instead of spinning just before it, so the CPU time is that of the work alone. The clients
+take turns; the ratios are medians over the rounds.
 
 rustypot is optional (`pip install ".[bench]"`).
 """
@@ -44,7 +44,7 @@ from hil.setup.realtime import real_time
 
 CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link.toml"
 REST_S = 1.5
-"""Time after a round of the stream in which the arm comes to rest [s]."""
+"""Time for which the arm may come to rest after each round of the stream [s]."""
 
 
 class Sleeping(WallClock):
@@ -110,7 +110,7 @@ def stream(device: str, config: Config) -> Iterator[Player]:
 
 
 def paced(cycle: Cycle, rate: float) -> Player:
-    """A client that plays one cycle per sample."""
+    """A client that runs one cycle per sample."""
 
     def play(samples: int) -> Round:
         ticks = FixedRate(Sleeping(), rate)
@@ -125,7 +125,7 @@ def paced(cycle: Cycle, rate: float) -> Player:
 
 @contextmanager
 def players(path: Path) -> Iterator[dict[str, Player]]:
-    """All clients, each with its own fake."""
+    """All clients, each with its own fake arm."""
     config = load_config(path)
     rate, servos = config.experiment.rate, sum(len(joint.ids) for joint in config.joints)
     clients = {"ours, exchange": ours, "dynamixel-sdk": sdk}

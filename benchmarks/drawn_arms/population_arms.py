@@ -92,7 +92,8 @@ def _models(random: np.random.Generator, joints: int) -> list[ServoModel]:
 class Stance(NamedTuple):
     """How an arm is mounted.
 
-    tilt: of its plane from the vertical [rad]. rest: rest angle of joint 1 [rad]. weight: gravity in the plane [m/s^2].
+    tilt: angle between its plane and the vertical [rad]. rest: rest angle of joint 1 [rad]. weight: gravity in the
+    plane [m/s^2].
     """
 
     orientation: str

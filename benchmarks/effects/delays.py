@@ -83,7 +83,7 @@ def drawn_arm(random: np.random.Generator) -> Arm:
 
 
 def drawn_torque(random: np.random.Generator, arm: Arm, rate: int) -> Array:
-    """For each joint, ten sines from 0.15 to 4 Hz, with a peak of about the torque of gravity (2, samples) [N m]."""
+    """For each joint, ten sines from 0.15 to 4 Hz, with a peak of about the gravity torque (2, samples) [N m]."""
     time_s = np.arange(round(SECONDS[rate] * rate)) / rate
     truth = arm.truth()
     found = []
@@ -140,7 +140,8 @@ def _motion(command: Array, interval: float, late: Array, links: Array, friction
             sample = step - logged[joint]
             if sample % steps == 0 and 0 <= sample < samples * steps:
                 position[joint, sample // steps] = state[joint]
-            # The middle of the step: a change within it acts from its beginning or end, 10 us off at the most.
+            # Evaluated at the middle of the step: a change within the step acts from its beginning or end, at most 10
+            # us off.
             at = int(np.floor(((step + 0.5) * h - delay[joint]) / interval))
             goal = command[joint, min(max(at, 0), samples - 1)]
             decay = np.exp(-h / lag[joint]) if lag[joint] > 0.0 else 0.0

@@ -2,8 +2,8 @@
 
     python benchmarks/effects/takeaway.py [--json]
 
-Identifies the realistic fake arm once, then measures on its run folder. Some figures need mujoco, pin (pinocchio),
-hatchling or Chromium; if the tool is not installed, the output says so.
+Identifies the realistic fake arm once, then takes the measurements from its run folder. Some figures need mujoco, pin
+(pinocchio), hatchling or Chromium; if one of them is not installed, the output says so.
 """
 
 import argparse

@@ -68,7 +68,9 @@ def main() -> None:
 
 
 def identify_all(config: Config, runs: int, other_motion: bool, folder: Path) -> Iterator[Identified]:
-    """Identify the unchanged arm `runs` times, and every changed one twice. config: with a [fake] arm of two joints."""
+    """Identify the unchanged arm `runs` times, and every changed one twice. config: describes a [fake] arm of two
+    joints.
+    """
     seed = 0
     wanted = [""] * runs + [f"{term}_{joint}" for term in TERMS for joint in (1, 2) for _ in range(2)]
     for changed in wanted:
@@ -80,7 +82,7 @@ def identify_all(config: Config, runs: int, other_motion: bool, folder: Path) ->
 
 
 def _identify(config: Config, changed: str, seed: int, other_motion: bool, folder: Path, path: Path) -> int:
-    """Identify with this seed or, if the motion exceeds the limits, with the next suitable one. Return the seed."""
+    """Identify with this seed or, if its motion exceeds limits, with the next suitable one; return the seed used."""
     for tried in range(seed, seed + 20):
         try:
             hil.identify(arm_after(config, changed, tried, other_motion, folder), out=path)

@@ -1,1 +1,1 @@
-"""Random faults against the complete program, judged from the emulated servos' own record."""
+"""Random faults injected while the complete program runs, judged from the emulated servos' own record."""

@@ -12,7 +12,8 @@ PERIOD_S = 2.0
 SCHEME = "campaign://"
 
 MIXED = "xl430_and_xl330"
-"""An arm that is in no file: one joint is voltage-driven, without Goal Current register; the other, current-driven."""
+"""An arm that is in no file: one joint is voltage-driven and has no Goal Current register; the other is current-driven.
+"""
 
 _MIXED_FROM = ("xl430_two_link", "xl330_two_link")
 """The files from which the joints of `MIXED` are taken, in this order."""
@@ -31,7 +32,9 @@ class Setting:
 
 
 def names() -> list[str]:
-    """The bundled configurations of planar arms, by file name; spatial arms have no safe stop that could be tested."""
+    """The bundled configurations of planar arms, by file name; spatial arms are left out, since cutting torque would
+    drop them.
+    """
     return sorted(path.stem for path in CONFIGS.glob("*.toml") if "urdf = " not in path.read_text(encoding="utf-8"))
 
 
@@ -99,7 +102,7 @@ def _load(name: str) -> dict[str, Any]:
 
 
 def _fake_arm(document: dict[str, Any]) -> dict[str, Any]:
-    """A fake arm for a configuration of real servos: the donor's arm, scaled to the configured torques."""
+    """A fake arm for a configuration of real servos: the fake arm of `_DONOR`, scaled to the configured torques."""
     arm = _load(_DONOR)["fake"]["arm"]
     share = document["experiment"]["peak_torque"][0] / _DONOR_TORQUE
     for link in arm["links"]:

@@ -1,4 +1,4 @@
-"""Executes injections: the complete command in this process, on a virtual arm behind a man in the middle."""
+"""Executes injections: runs the complete command in this process, on a virtual arm behind a man in the middle."""
 
 import contextlib
 import io
@@ -54,7 +54,9 @@ FREE = frozenset({"Goal Position", "Registered Instruction"})
 """Registers that a servo writes itself, independently of any program."""
 
 _LIMITS_LEFT = frozenset({Kind.KILLED, Kind.LOWERED_LIMIT})
-"""After this pair, the first start finds the limit as the other program left it; the second, as the killed run did."""
+"""After these two faults together, the next start finds the limit set by the other program, and the start after that
+finds the limit that the killed run left.
+"""
 
 _PACKAGE = "benchmarks.fault_campaign"
 _ARMS = (1, 12)

@@ -156,7 +156,8 @@ BESIDE: dict[str, frozenset[str]] = {
     Kind.RAISED_LIMIT: frozenset({SETTING, STRANGER}),
     Kind.ANSWERS_LESS: frozenset({SETTING, STRANGER}),
 }
-"""What a message may mention besides the cause of a stop: a real change by another program that stops nothing."""
+"""What a message may mention besides the cause of a stop: a real change by another program that does not stop the run.
+"""
 
 _OF_FIELD = {
     "position": _READINGS | {LIMIT, POSE},

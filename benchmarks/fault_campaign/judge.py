@@ -143,7 +143,7 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
         )
     left_on = bool(driven[time > story.ended + config.safety.watchdog + 1e-3 * TRIP_MS].any())
     was_killed = any(each.kind == Kind.KILLED and each.start <= story.ended for each in drawn.attacks)
-    # A killed program says nothing; here it lives on, cut off from the bus.
+    # A killed program prints nothing; here, it continues to run, cut off from the bus.
     named, misleading = judge_words(drawn, story.text) if story.code and not was_killed else (None, False)
     limits = np.array([joint.position_limit for joint in config.joints])
     position = story.record["position"]
@@ -238,10 +238,10 @@ def acts_at(attack: Attack, attacks: Sequence[Attack]) -> float:
 
 
 def since_again(driven: NDArray[np.float64], since: float, again: list[float]) -> float:
-    """When the current had to end [s] if another program switched torque on again, at the times `again`.
+    """Time at which the current had to end [s] if another program switched torque on again, at the times `again`.
 
-    driven: times at which current flowed [s]. The time limit restarts at such a time if the current had ended in time
-    after `since`, had been off for `LASTING_MS` (longer than while goals pass through zero), and then flows again.
+    driven: times at which current flowed [s]. The time limit restarts at such a time if the current ended in time after
+    `since`, was off for `LASTING_MS` (longer than goals take to pass through zero), and then flows again.
     """
     for when in sorted(again):
         begins = when - 1e-3 * UNSURE_MS
@@ -286,7 +286,7 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
     time = record["time"][:, 0]
     interval = 1.0 / config.experiment.rate
     joints = range(len(config.joints))
-    # While servos are set up, before the first goals of a servo with torque, nobody needs to be heard regularly.
+    # During set-up, before the first goals are sent with torque on, no servo needs to be heard regularly.
     holds = np.asarray(record["torque"].any(axis=1))
     holds &= time > told.first_goal(float(time[np.argmax(holds)]))
     # A fault that makes the set-up longer delays the motion, and changes nothing else in it.
@@ -331,7 +331,9 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
 
 
 def _not_before(what: str, when: float, helpless: Sequence[tuple[float, float]]) -> float:
-    """When the current had to end [s] after a failure at `when`; if a servo was silent, once something could end it."""
+    """Time at which the current had to end [s] after a failure at `when`; if a servo was silent, not before anything
+    could end it.
+    """
     until = [end for since, end in helpless if since <= when < end]
     return max([when, *until]) if what.endswith("was not heard") else when
 
@@ -387,7 +389,7 @@ def overruled_ms(config: Config, story: Story, told: "Told") -> float:
 
 
 def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int, gap_ms: int) -> Reason | None:
-    """When [s] a failure began that lasted at least `hold_ms`, including interruptions of up to `gap_ms`."""
+    """Time [s] at which a failure began that lasted at least `hold_ms`, including interruptions of up to `gap_ms`."""
     at = np.flatnonzero(wrong)
     if not at.size:
         return None

@@ -133,7 +133,8 @@ def _reconfigure(attack: Attack, servo: EmulatedServo) -> Undo | None:
         case Kind.LOWERED_LIMIT:
             return _change(servo, limit, round(attack.amount * servo.value(limit)))
         case Kind.RAISED_LIMIT if limit == "Current Limit":
-            # A tick less than the largest limit, which may be the user's own: that one is not the attack's to undo.
+            # One tick less than the largest limit, because undoing the attack must not change a largest limit that the
+            # user has set.
             return _change(servo, limit, min(2 * servo.value(limit), servo.model.registers[limit].maximum - 1))
         case Kind.THROTTLED if servo.operating_mode == 0 and "Goal PWM" in servo.memory:
             return _change(servo, "Goal PWM", round(attack.amount * servo.value("PWM Limit")))

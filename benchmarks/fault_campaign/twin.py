@@ -32,7 +32,7 @@ SAME_RAD, SAME_RAD_S = 0.02, 0.15
 """Largest difference of angles, and RMS difference of velocities, that ordinary encoders and velocity filters cause."""
 
 LAGS_S = np.linspace(0.0, LAG_S, 7)[1:]
-"""Lags of a velocity that are tried [s]."""
+"""Velocity lags to try [s]."""
 
 LAGGING_S = 0.2
 """Length of the intervals [s] in each of which a lag must reduce the RMS difference of velocities to an ordinary value:

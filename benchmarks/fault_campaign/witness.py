@@ -22,7 +22,7 @@ SLIPS_S = 0.05
 """Time in which a joint slips on its shaft [s]."""
 
 HALF = 0.5
-"""Share of its torque constant that a motor loses when its magnet overheats."""
+"""Fraction of the torque constant that a motor loses when its magnet overheats."""
 
 SOFT_RAD = 0.02
 """Distance over which an obstacle, or a cable that snags, reaches its full force [rad]."""
@@ -100,7 +100,7 @@ class Witness:
             before, most = felt[joint], each.amount * self._largest[joint]
             match each.kind:
                 case Kind.WEAK:
-                    # A weaker motor induces less voltage, and one that is turned round the opposite one.
+                    # A weaker motor induces less voltage, and a reversed motor the opposite voltage.
                     before += (1.0 - each.amount) * self._held_back(joint)
                     felt[joint] = each.amount * before
                     self._missing[joint] += before - felt[joint]

@@ -92,7 +92,7 @@ EQUIVALENT = {
     ("for _ in range(0, self._plan.end_samples", "0  ->  1"): "stream: a multiple of the window has as many steps",
     ("ticks.wait() if number else", "0.0  ->  1.0"): "stream: a value that is not used",
     ("_NEVER = ", "62  ->  124"): "exchange: more cycles than any run has",
-    ("self._modes_due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: the first look sets it",
+    ("self._modes_due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: the first comparison sets it",
     (
         "self._clock = [",
         "0.0  ->  1.0",
@@ -104,7 +104,7 @@ _SLOW_IMPORTS = (
     *("numpy", "scipy", "numba", "pydantic", "serial", "hil.estimator.identify"),
     *("hil.estimation.settled_estimate", "hil.dry_run.ensemble", "hil.plan.chain_plan"),
 )
-"""Imported once, before the children are forked. These import few of the modules under test."""
+"""Modules that are imported once, before the child processes are forked; they import few of the modules under test."""
 
 Change = Callable[[], None]
 

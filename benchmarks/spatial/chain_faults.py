@@ -20,8 +20,8 @@ unsafe          at least one of these happened:
                 - A joint overshot its limits by more than lowering the arm may cause.
                 Nothing can end the current after a kill while another program feeds the watchdogs, so this time does
                 not count (`judge.fed_by_another`).
-lying           of the runs stopped while the arm could still be commanded, the number in which current was only
-                switched off in the rest pose
+lying           of the runs stopped while the arm could still be commanded, the number in which current was switched
+                off only once the arm was in its rest pose
 """
 
 import argparse
@@ -309,11 +309,11 @@ def figures(outcomes: Iterable[ChainOutcome]) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--injections", type=int, default=INJECTIONS, help="number, over all settings")
+    parser.add_argument("--injections", type=int, default=INJECTIONS, help="total number over all settings")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--only", choices=NAMES)
     parser.add_argument("--rate", type=int, choices=RATES)
-    parser.add_argument("--show", action="store_true", help="print every outcome that is not good")
+    parser.add_argument("--show", action="store_true", help="print every outcome with a problem")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     settings = [

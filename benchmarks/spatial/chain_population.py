@@ -1,4 +1,5 @@
-"""Random spatial arms with three to six joints, identified on the fake bus from a description with masses 30 % off.
+"""Random spatial arms with three to six joints, identified on the fake bus from a description whose masses are 30 %
+off.
 
     python benchmarks/spatial/chain_population.py --arms 60 [--first 0] [--plain] [--json]
 

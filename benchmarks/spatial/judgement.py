@@ -19,7 +19,7 @@ WRONG_TORQUE, WRONG_STDS, WRONG_SHARE = 2.0, 3.0, 0.1  # percent of the torque; 
 def joint_1_unit(config: Config, found: hil.Identification) -> float:
     """Ratio of joint 1's true torque per goal to the configured value, which is the torque unit of a result.
 
-    1 if torque scales were not estimated, since every joint's configured constant was then trusted.
+    The ratio is 1 if torque scales were not estimated, since every joint's configured constant was then trusted.
     """
     assert config.fake is not None and config.fake.chain is not None
     if "torque_scale_2" not in found.extra:

@@ -2,10 +2,10 @@
 
 The arm is a MuJoCo model with the described geometry and masses. The unknowns are the pseudo-inertia of every link (10
 parameters of a Cholesky factor relative to the description's), and armature, damping, friction loss and a constant
-torque of every joint. Their number is about that of hil's stage 2. The arm would fall in an open-loop simulation, so
-the software spring and damper are part of the model, as an affine bias. The method gets every advantage: the true lag,
-an initial state from the Fourier series of the period, an initial guess as close as hil's, its own optimiser with
-rollouts on all cores, and two integration steps per sample.
+torque of every joint. There are about as many of them as parameters in hil's stage 2. The arm would fall in an
+open-loop simulation, so the software spring and damper are part of the model, as an affine bias. The method gets every
+advantage: the true lag, an initial state from the Fourier series of the period, an initial guess as close as hil's, its
+own optimiser with rollouts on all cores, and two integration steps per sample.
 """
 
 import io

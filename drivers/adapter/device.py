@@ -14,7 +14,7 @@ _USB_PORTS = ("ttyUSB*", "ttyACM*")
 
 
 def is_pseudo_terminal(device: str) -> bool:
-    """Whether this is a pty; the program at its other end may also keep this end open."""
+    """Whether the device is a pty; the program at its other end may also keep this end open."""
     return Path(device).resolve().parent == Path("/dev/pts")
 
 
@@ -47,7 +47,7 @@ def _leads_to(link: Path, wanted: str) -> bool:
 def true_baud(descriptor: int) -> int | None:
     """Return the baud rate at which the driver runs the device; None if the system does not report it.
 
-    A driver does not refuse a rate that its adapter does not support; it sets another one instead.
+    If the adapter does not support a requested rate, its driver reports no error but sets a different rate.
     """
     speeds = bytearray(_SPEEDS.size)
     try:
@@ -60,7 +60,7 @@ def true_baud(descriptor: int) -> int | None:
 def adapter_name(device: str, sysfs: Path = _SYSFS) -> str:
     """Return a name for a device's USB adapter that, unlike the device path, stays the same after replugging.
 
-    Returns "" if the adapter has no serial number, or if another adapter that is plugged in has the same number.
+    Returns "" if the adapter has no serial number, or if another connected adapter has the same number.
     """
     if "://" in device:
         return ""

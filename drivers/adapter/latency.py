@@ -11,13 +11,13 @@ FACTORY_MS = 16
 WANTED_MS = 1
 
 LOCAL_S = 1e-3
-"""Latency allowed for a device without a latency timer [s]: CDC-ACM adapter (one USB frame), UART, pty or fake bus."""
+"""Assumed latency of a device without a latency timer [s]: CDC-ACM adapter (one USB frame), UART, pty or fake bus."""
 
 REMOTE_S = 16e-3
-"""Latency allowed for a port on a network [s]."""
+"""Assumed latency of a port on a network [s]."""
 
 BLUETOOTH_S = 60e-3
-"""Latency allowed for a serial port over Bluetooth [s]."""
+"""Assumed latency of a serial port over Bluetooth [s]."""
 
 _SYSFS = Path("/sys")
 
@@ -40,7 +40,9 @@ def read_latency_ms(file: Path) -> int:
 
 
 def write_latency_ms(file: Path, value_ms: int = WANTED_MS) -> bool:
-    """Set the timer; return whether it reads back as set. Requires root, or a udev rule that grants write access."""
+    """Set the timer; return whether the new value was read back. Requires root, or a udev rule that grants write
+    access.
+    """
     try:
         file.write_text(str(value_ms))
     except OSError:

@@ -9,10 +9,10 @@ from hil.drivers.sync_read import Answer, GroupRead
 __all__ = ["MOST_MIXED_UP", "MOST_STRANGERS", "Heard"]
 
 MOST_STRANGERS = 2
-"""Tolerated number of foreign packets heard during an experiment; a late reply can look like one."""
+"""Number of foreign packets that are tolerated during an experiment, since a late reply can look like one."""
 
 MOST_MIXED_UP = 2
-"""Tolerated number of replies whose IDs do not match the request; no answer in such a reply is used."""
+"""Number of tolerated replies whose IDs do not match the request; no answer in such a reply is used."""
 
 _RECENT_S = 0.1
 _INSTRUCTIONS = frozenset(Instruction) - {Instruction.STATUS}
@@ -23,9 +23,9 @@ _LONGEST_CUT_OFF = 64
 """Largest LEN at which a truncated instruction is recognised as such; a damaged LEN is usually larger."""
 
 _LEAST_REPEATED = 4
-"""Minimum length at which part of a reply is recognised when it arrives again [bytes]."""
+"""Minimum length at which a repeated part of a reply is recognised as such [bytes]."""
 
-_PART_OF_A_REPLY = 8  # bytes; at least the header of a fast reply, whose first servos have then answered
+_PART_OF_A_REPLY = 8  # bytes that may accompany intact answers in a cut-off reply: a fast reply's header
 
 
 class Heard:
@@ -47,7 +47,7 @@ class Heard:
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """Number of replies since the last late one that contain one answer per servo but not the requested IDs."""
+        """Number of replies, since the last late reply, that contain one answer per servo but not the requested IDs."""
         self.strangers: float = 0
         """Number of received packets that another master sent or requested."""
 
@@ -74,7 +74,7 @@ class Heard:
         self.late_at, self.mixed_up = now, 0
 
     def instead(self, read: GroupRead, received: bytes, answers: Sequence[Answer], now: float, *, echoes: bool) -> None:
-        """Examine bytes received instead of the regular reply to `read`; `answers` are those found in them."""
+        """Examine bytes received instead of the regular reply to `read`; `answers` are the answers found in them."""
         self.beside(received, echoes=echoes)
         if any(front in self._expected - read.expected for front in _fronts_of_replies(received)):
             self._was_late(now)  # the beginning of a reply to an earlier request
@@ -91,7 +91,7 @@ class Heard:
             self.strangers += sum(self._is_anothers(*front) for front in _fronts_of_instructions(received))
 
     def continued(self, before: bytes, received: bytes, now: float) -> None:
-        """Examine bytes that may be the rest of a reply that was incomplete when time was up.
+        """Examine bytes that may be the rest of a reply that was incomplete when its timeout expired.
 
         before: the bytes that had been received by then.
         """

@@ -17,7 +17,7 @@ GOALS, MODES, TORQUE = range(3)
 """Kinds of read-back, as indices into `ReadBack.reads`."""
 
 _OTHERS_S = {MODES: 0.025, TORQUE: 0.1}
-"""Mean time between two read-backs of the modes, and of Torque Enable [s]; in between, the goals are read back.
+"""Mean time between two read-backs of the modes, and between two of Torque Enable [s]. In between, goals are read back.
 
 The actual time is random. Otherwise, a program that overwrites goals periodically might always do so just when the
 modes are read.
@@ -27,14 +27,14 @@ _GOALS_PER_OTHER_IN_DOUBT = 4
 """Minimum number of goal read-backs between two read-backs of other kinds while a foreign value is suspected."""
 
 _RECENT = 4
-"""After lost writes, a servo may still hold any of the latest `_RECENT` goals; the status detects longer losses."""
+"""After lost writes, a servo may still hold any of the latest `_RECENT` goals; longer losses show in the status."""
 
 _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Numbers of read-backs of a foreign value that prove another writer, and the time within which they must occur [s].
 
 Three read-backs of the same value are required for a goal that this program may have written in an earlier cycle, and
 for 0, which a servo itself may have set. By then, the status would have revealed lost writes, a tripped watchdog or a
-reboot; and writes that are lost occasionally leave a different goal each time.
+reboot; and if writes are lost only occasionally, the servo holds a different goal each time.
 """
 
 _UNSURE_S = 0.01
@@ -57,12 +57,12 @@ detected. Every fourth such read-back is of Torque Enable.
 """
 
 _DELAYED_SHARE, _DELAYED_SHARE_IN_DOUBT = 0.01, 0.1
-"""Ratio of the delay caused by an overdue read-back to the longest time until the next one; the second value applies
-while a foreign value is suspected. If the delay is short, read-backs are thus less than `OVERDUE_S` apart.
+"""Delay caused by an overdue read-back, as a fraction of the longest time until the next one; the second value applies
+while a foreign value is suspected. After a short delay, the next read-back thus follows sooner than `OVERDUE_S`.
 """
 
 LOST_GOALS, LOST_OF = 3, 6
-"""A servo that misses `LOST_GOALS` of `LOST_OF` goals counts as not accepting them, even if the next one arrives.
+"""A servo that misses `LOST_GOALS` of `LOST_OF` goals counts as not accepting goals, even if it receives the next one.
 
 The status check needs two consecutive missed goals: if every second goal is lost, it may not notice for 0.1 s. If one
 goal in a hundred is lost, missing three of six is rarer than missing two consecutive ones.
@@ -135,7 +135,7 @@ class ReadBack:
         self.modes_seen_at = -math.inf
         """Time of the latest read-back in which every servo had the expected settings [s]."""
         self._due = {MODES: -math.inf} | ({TORQUE: -math.inf} if watches_torque else {})
-        """When the registers other than goals are due [s]."""
+        """Times at which the registers other than goals are due [s]."""
         self._goals_since = 0
         self._was_of_goals = False
         self._draws = {kind: Random(kind) for kind in (GOALS, MODES, TORQUE)}
@@ -184,7 +184,7 @@ class ReadBack:
         self.longest = max(_FADES * self.longest, seconds)
 
     def postponed(self, now: float) -> None:
-        """Record the fact that a cycle left no time for a read-back."""
+        """Record that a cycle left no time for a read-back."""
         self.overdue_at = min(self.overdue_at, now + OVERDUE_S)
 
     def delayed(self, now: float, delay: float, *, alone: bool) -> None:
@@ -237,7 +237,7 @@ class ReadBack:
         told = [(at, each[1]) for at, each in enumerate(intact) if each is not None]
         self.watchdogs = told if self.kind == GOALS else []
         if self.kind == TORQUE:
-            # An alert, which explains it, is found in the next cycle.
+            # If an alert explains why torque is off, the next cycle finds it.
             self.torque_off = next(
                 (at for at, is_on in told if not is_on and not (servos[at] or (0,))[0] & ALERT), None
             )

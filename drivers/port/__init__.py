@@ -16,7 +16,7 @@ __all__ = ["GROWTH", "DescriptorPort", "NetworkPort", "Port", "ReplyTime", "open
 
 
 def open_port(url: str, baud: int) -> Port:
-    """Open a device or pyserial URL; raises PortNotOpened, whose message states the reason and the remedy."""
+    """Open a device or pyserial URL. Raises PortNotOpened; its message gives the reason and the remedy."""
     line = open_serial(url, baud)
     if hasattr(line, "_socket"):
         return NetworkPort(url, baud, line)

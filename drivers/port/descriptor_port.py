@@ -159,12 +159,12 @@ class DescriptorPort(Port):
         super().close()
 
     def _forget_descriptor(self) -> None:
-        """Never use the closed descriptor's number again, since it may soon be that of another file."""
+        """Forget the number of the closed descriptor, since another file may soon be opened under it."""
         self._descriptor = -1
         self._wait_ms = _never_ready
 
     def _read_on(self, received: bytes, count: int, deadline: float) -> bytes:
-        """Read the rest of a fragmented reply. Uses select because poll only has a resolution of one millisecond."""
+        """Read the rest of a fragmented reply. Uses select because poll has a resolution of only one millisecond."""
         while len(received) < count:
             remaining = max(0.0, deadline - _now())
             if not select.select([self._descriptor], [], [], remaining)[0]:

@@ -56,7 +56,7 @@ class Port:
         self.late_replies = 0
         """Number of late replies during set-up work since torque was last switched on."""
         self.growth = GROWTH
-        """Factor by which the wait grows with each attempt at a set-up exchange; 1 while servos have torque."""
+        """Factor by which the wait grows with each attempt at a set-up exchange; 1 while torque is on."""
         self._serial = opened
         self._timeout: float | None = opened.timeout
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()
@@ -110,8 +110,8 @@ class Port:
     def ask(self, data: bytes, count: int, expected: ReplyTime, start: float) -> bytes:
         """Write at `start` [s, on the port's clock], then read until the timeout, as the control cycle does.
 
-        Pending input is set aside first: otherwise a late reply would be taken for the reply to this request, and every
-        later one would be a cycle late.
+        Pending input is set aside first: otherwise, a late reply would be taken for the reply to this request, and
+        every later reply would be used one cycle late.
         """
         if self.has_input():
             self.put_aside()
@@ -159,7 +159,7 @@ class Port:
         return read_latency_ms(file) <= WANTED_MS
 
     def close(self) -> None:
-        """Close the port; has no effect if it is already closed or the cable is gone."""
+        """Close the port; has no effect if it is already closed or the cable is unplugged."""
         self.is_open = False
         with contextlib.suppress(*FAILURES):
             self._serial.close()

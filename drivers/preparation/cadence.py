@@ -1,4 +1,4 @@
-"""Number of exchanges per sample, and of exchanges between two status reads, within the limits of wire time."""
+"""Chooses how many exchanges are made per sample and per status read; the time on the wire limits both."""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +33,8 @@ def cadence(
     if not sample:
         return 1, None, 0
     modes, count = [drive.mode for drive in drives], len(drives)
-    # Without a current sensor in the motor, a loss of torque shows first in Torque Enable: worth a late sample.
+    # If the current is not sensed in the motor, a loss of torque shows first in Torque Enable: reading it is worth a
+    # late sample.
     share = _MOST_SHARE if any(drive.servo.senses_supply for drive in drives) else _SHARE
     goals = 14 * len(set(modes)) + 3 * count
     every, interval = 1, sample

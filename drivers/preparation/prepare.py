@@ -21,7 +21,9 @@ SLOWEST_S = 0.1
 
 _TRIPS = 5
 _TIMES, _APART_S = 6, 0.05
-"""Number of repeated measurements before slow replies are attributed to the adapter, and the time between two [s]."""
+"""Number of repeated measurements before slow replies are attributed to the adapter, and the time between two
+measurements [s].
+"""
 
 _PING_BYTES = 24  # on the wire: the ping and its status
 _STATUS_BYTES = 14

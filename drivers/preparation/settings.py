@@ -40,8 +40,8 @@ Other writable EEPROM registers are not restored:
 """
 
 EEPROM = ("Current Limit", "Operating Mode", *PROTECTIVE)
-"""EEPROM registers to restore, in this order: a change of Operating Mode sets Goal Current to Current Limit, which is
-what most servos held before, so that no goal has to be written.
+"""EEPROM registers to restore, in this order: a change of Operating Mode sets Goal Current to Current Limit. Most
+servos held that value before, so usually no goal has to be written.
 """
 
 # Not restored: LED, which only shines; Torque Enable, which is cut; Goal Position (see above).
@@ -60,7 +60,7 @@ _GOALS = ("Goal PWM", "Goal Current", "Goal Velocity")
 
 RAM = (STATUS_LEVEL, *_GAINS, *_GOALS)
 """Registers in RAM to restore. Status Return Level comes first, so that the other writes are confirmed; goals come
-last, once the mode and limits are those to which they belong.
+last, once the mode and the limits that they belong to have been restored.
 """
 
 _BOUNDS = {
@@ -119,8 +119,8 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
     """Restore the registers that differ from `settings`; return their old and new values by name.
 
     Goals are restored as far as the servo's limits allow (`attainable`), and only if torque is still off and the mode
-    and limits are those to which the goals belong: in current mode, the former goal of a position-controlled servo is
-    full torque. The Bus Watchdog is cleared only then, since it may be all that stops the motor. Each register is read
+    and the limits have been restored: in current mode, the former goal of a position-controlled servo would mean full
+    torque. The Bus Watchdog is not cleared before that, since it may be all that stops the motor. Each register is read
     back.
 
     Raises WrongSetting if torque is on, and TorqueDoubted if EEPROM is locked although torque reads back as off. Raises
@@ -144,7 +144,7 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
         _restore(servo, settings, goals, written, failures)
     if failures:
         failed = next(iter(failures.values()))
-        if len(failures) < len(RAM):  # otherwise the servo is hardly there
+        if len(failures) < len(RAM):  # otherwise the servo is probably not connected
             failed.in_doubt = tuple(failures)
             failed.args = (f"{failed} Only {', '.join(failures)} may differ; all other settings are as before.",)
         raise failed
@@ -205,8 +205,8 @@ def _restore(
 
 
 def _surely(servo: Servo, name: str) -> int | None:
-    """Read a register whose value may be attributed to another program; None if the readings disagree and this program
-    has written the register too. Raises InconsistentReplies if only another program can have changed it.
+    """Read a register twice and return its value. If the readings disagree, return None for a register that this
+    program writes, and raise InconsistentReplies for one that only another program can have changed.
     """
     try:
         return servo.read_surely(name)

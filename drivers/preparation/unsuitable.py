@@ -7,14 +7,15 @@ _TIME_BASED_PROFILE = 0x04
 
 _POSITION_MODE = 3
 _MOST_HOMING_TICKS = 1024
-"""Position Control Mode ignores a Homing Offset beyond this (e-Manual, Homing Offset)."""
+"""Largest Homing Offset [ticks] that Position Control Mode applies; it ignores larger ones (e-Manual, Homing Offset).
+"""
 
 APPLY_HOMING = (
     f"Position Control Mode ignores an offset beyond +-{_MOST_HOMING_TICKS} ticks, but current and PWM mode apply it, "
     "so the joint's angle would change when a run begins. With DYNAMIXEL Wizard 2.0, set Operating Mode to 4 (Extended "
     "Position), which applies it too, or clear Homing Offset; then determine zero_ticks again"
 )
-"""Explanation of and remedy for an `ignored_homing`; the caller adds further words or the full stop."""
+"""Text that explains an `ignored_homing` and how to correct it; the caller appends further words or the full stop."""
 
 
 def unsuitable_drive_mode(servo: Servo) -> int | None:

@@ -1,1 +1,1 @@
-"""Torque of the servos: switched on with armed watchdogs, and off with read-back."""
+"""Switches the servos' torque on with armed watchdogs, and off with read-back."""

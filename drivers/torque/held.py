@@ -14,7 +14,7 @@ FADE_S = 1.0
 """Time over which a held servo's output limit is reduced to zero [s]."""
 
 SINKING_S = 4.0
-"""Longest time for which joints may sink, braked by their motors, before torque is cut [s]."""
+"""Maximum time for which joints may sink, braked by their motors, before torque is cut [s]."""
 
 _STEPS = 20
 _STILL_TICKS = 2  # Present Velocity below which a joint counts as still
@@ -60,9 +60,9 @@ def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
     """Ramp the output of held servos down to zero, wait until the joints no longer sink, then cut torque and restore
     the goals that limited their output.
 
-    With zero PWM and torque on, the motor's terminals are shorted, so it brakes. Raises the errors of `Servo.write`;
-    an exception that ends the sinking early gets a note on the goals that are left lowered, since restoring them with
-    torque on would jerk the arm back up.
+    With zero PWM and torque on, the motor's terminals are shorted, so it brakes. Raises the errors of `Servo.write`; if
+    an exception ends the sinking early, a note added to it lists the goals that remain lowered, since restoring them
+    with torque on would jerk the arm back up.
     """
     held = [servo for servo in servos.values() if is_held(servo)]
     names = [_what_drives(servo) for servo in held]
@@ -93,8 +93,8 @@ def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
 def _lowered(goals: Iterable[tuple[Servo, str, int]]) -> str:
     listed = ", ".join(f"{name} of ID {servo.id}, which was {begun}" for servo, name, begun in goals)
     return (
-        f"The arm was being let down and has been left with a lowered {listed}. Hold the arm by hand, switch its "
-        "torque off and set this again with DYNAMIXEL Wizard 2.0, or start again with --take-over."
+        f"The arm was being lowered slowly and has been left with a reduced {listed}. Hold the arm by hand, switch "
+        "its torque off and set this again with DYNAMIXEL Wizard 2.0, or start again with --take-over."
     )
 
 

@@ -8,8 +8,8 @@ before torque is cut, torque off is sent three times, since a packet may be lost
 the silence, all servos not yet confirmed are polled again, several times.
 
 Ctrl-C raises KeyboardInterrupt at any point of the program, even between two servos while torque is being cut. A
-program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
-signals back while torque is cut.
+program that uses the driver as a library may not have signal handlers that merely set a flag, so the driver itself
+holds signals back while torque is cut.
 """
 
 import signal
@@ -34,7 +34,7 @@ _INTERRUPTS_BORNE = 5
 """Number of attempts interrupted by Ctrl-C after which cutting a servo's torque counts as failed."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
-"""Maximum delay of a watchdog beyond its timeout [s], since it counts in steps of 20 ms."""
+"""How long after its timeout a watchdog may trip [s], since it counts in steps of 20 ms."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
 """Number of further torque-off packets and the time between them [s]: a packet that collides with a reply is lost."""
@@ -44,14 +44,14 @@ _REPEATS, _REPEAT_S = 2, 0.001
 class TorqueOff:
     """Result of an attempt to cut torque.
 
-    confirmed: joints whose servos were read back as off.
+    confirmed: joints whose servos' torque was read back as off.
     unconfirmed: the other joints, each with the reason.
     unwatched: confirmed or unconfirmed joints whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
     rebooted: confirmed joints whose servos were reset, which disarmed the watchdog armed before torque was switched on.
     disarmed: confirmed joints whose servos were not reset, but whose watchdog another program switched off.
     tripped: joints whose Bus Watchdog may have tripped, which zeroes their goals; it has been cleared since.
-    driven: the remaining joints, because another program switches their servos' torque on whenever it is cut.
+    driven: the remaining joints; another program switches their servos' torque on whenever it is cut.
     """
 
     confirmed: tuple[Joint, ...]
@@ -69,7 +69,7 @@ class TorqueOff:
         return not self.unconfirmed and not self.driven
 
     def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
-        """Return the report after another program has switched torque on again.
+        """Return the report, updated because another program has switched torque on again.
 
         on: joints whose servos' torque is on again each time it is cut. silent: joints whose servos have not
         answered since.
@@ -83,12 +83,13 @@ class TorqueOff:
         )
 
     def with_doubted(self, joint: Joint, why: str) -> "TorqueOff":
-        """Return the report with a joint no longer confirmed, although its servo reads back as off."""
+        """Return the report with a joint no longer confirmed, although its servo's torque reads back as off."""
         confirmed = tuple(each for each in self.confirmed if each != joint)
         return replace(self, confirmed=confirmed, unconfirmed=(*self.unconfirmed, (joint, why)))
 
     def with_later(self, joint: Joint, *, rebooted: bool | None) -> "TorqueOff":
-        """Return the report with a joint now confirmed, since its servo has answered again and reads back as off.
+        """Return the report with a joint now confirmed, since its servo has answered again and its torque reads back as
+        off.
 
         rebooted: result of `was_rebooted`.
         """
@@ -168,7 +169,8 @@ def cut_torque(
     watchdog: float,
     interrupts: list[BaseException],
 ) -> tuple[tuple[Joint, ...], tuple[tuple[Joint, str], ...]]:
-    """Cut torque on all servos and read it back. Returns the confirmed joints, and the others, each with the reason.
+    """Cut torque on all servos and read it back. Return the confirmed joints, and the others, each with the reason why
+    it is not confirmed.
 
     silent: servos that did not answer the last exchange.
     watchdog: timeout of the servos' Bus Watchdogs [s].
@@ -201,7 +203,7 @@ def cut_torque(
         if failed is not None and not lost:
             if isinstance(failed, NoReply):
                 break
-            tell()  # a damaged reply shows that it receives, so its watchdog is not what stops it
+            tell()  # a damaged reply shows that the servo still receives packets, so its watchdog will not stop it
     if left and not lost:
         wait(watchdog + TRIP_S)
         tell()
@@ -243,7 +245,8 @@ def _tell(port: Port, servos: Mapping[Joint, Servo], register: str, value: int, 
 def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> frozenset[Joint]:
     """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more.
 
-    Return the joints whose watchdog has tripped or may have tripped; once it is off, this can no longer be read.
+    Return the joints whose watchdog has tripped or may have tripped; once a watchdog is off, this can no longer be
+    read.
     """
     tripped = set(servos)
 

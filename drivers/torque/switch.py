@@ -24,7 +24,7 @@ from hil.drivers.torque.off import (
 )
 
 WATCH_S = 0.1
-"""Interval at which Torque Enable is read while the arm must be without torque [s]."""
+"""Interval at which Torque Enable is read while torque must stay off [s]."""
 
 
 class TorqueSwitch:
@@ -55,9 +55,9 @@ class TorqueSwitch:
         return set()
 
     def refuse_switched_on(self) -> None:
-        """Check that torque is still off after this program has found it off or switched it off.
+        """Check that torque is still off, after this program has found it off or switched it off.
 
-        If it is on, another program has switched it on; torque is then cut on all servos. Raises BusShared or
+        If it is on, another program has switched it on; this method then cuts torque on all servos. Raises BusShared or
         TorqueNotOff.
         """
         if not (found := switched_on(self._servos)):
@@ -162,7 +162,8 @@ class TorqueSwitch:
         return self.torque_off_report
 
     def shorten_watchdogs(self, seconds: float) -> None:
-        """Shorten the timeouts of the armed Bus Watchdogs to `seconds` [s] until torque is off; keep shorter timeouts.
+        """Shorten the timeouts of the armed Bus Watchdogs to `seconds` [s] until torque is off; leave shorter timeouts
+        unchanged.
 
         Nothing is read back: a servo that misses the packet keeps its previous timeout.
         """
@@ -188,7 +189,7 @@ class TorqueSwitch:
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
 
     def has_torque(self) -> bool:
-        """Read outside the control cycle whether torque is on at all servos; False if a servo does not answer."""
+        """Read outside the control cycle whether all servos have torque on; False if one does not answer."""
         return all(is_torque_on(servo) for servo in self._servos.values())
 
     def cut_foreign_torque(self, on: Collection[Joint]) -> None:

@@ -38,8 +38,8 @@ TICK_S = 1e-3
 class FakeBus:
     """The wire, the adapter, the servos and the plant.
 
-    joints: for each servo, the index of the plant joint that it moves, so that two servos may move one joint; by
-    default servo i moves joint i.
+    joints: for each servo, the index of the plant joint that it moves; by default, servo i moves joint i. Two servos
+    may move the same joint.
 
     The plant's time is 0 when the bus is created. Times in this class are in seconds on `clock`, except `time` and the
     times of faults, which count from the creation of the bus.
@@ -63,7 +63,7 @@ class FakeBus:
         self.packets = 0
         """Number of valid packets sent by the host."""
         self.pulls = 0
-        """Number of times the adapter's cable was unplugged. A port that was open when this happened stays lost."""
+        """Number of times the adapter's cable was unplugged. A port that was open at that moment must be reopened."""
         self.cable_is_out = False
         self.pulled_at = -math.inf
         """Time on `clock` at which the cable was last unplugged [s]."""
@@ -102,7 +102,7 @@ class FakeBus:
 
     @property
     def servos(self) -> dict[int, EmulatedServo]:
-        """The servos by current ID, advanced to the clock's current time; of servos that share an ID, only the last."""
+        """Servos by current ID, advanced to the clock's current time; if several have the same ID, only the last."""
         self.advance(self.clock.now())
         return {servo.id: servo for servo in self._servos}
 

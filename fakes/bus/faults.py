@@ -185,7 +185,7 @@ class Fault(Described):
 
 
 def _wrong_amount(kind: FaultKind, amount: float | None) -> str:
-    """Say what is allowed if a kind of fault cannot have this amount; otherwise return ""."""
+    """Return what is allowed, in words, if a fault of this kind cannot have this amount; otherwise ""."""
     facts = FAULTS[kind]
     if amount is None or (facts.amount and facts.allows(amount)):
         return ""
@@ -206,8 +206,8 @@ Effect = Callable[[Fault], None]
 class Faults:
     """The faults of one bus: pending ones, active ones, and a record of those that took effect (`happened`).
 
-    begin, end: apply a fault to the servos, and undo it. catch_up: advances the bus to the present, so that what is
-    added or cleared now does not take effect at the time of the last packet.
+    begin, end: apply a fault to the servos, and undo it. catch_up: advances the bus to the present, so that adding or
+    clearing a fault does not take effect at the time of the last packet.
     """
 
     def __init__(self, seed: int, begin: Effect, end: Effect, catch_up: Callable[[], None] = lambda: None) -> None:
@@ -229,7 +229,7 @@ class Faults:
     def add(self, *faults: Fault) -> None:
         """Add faults; those whose start time has passed begin immediately.
 
-        Raises ValueError for an amount that is not allowed, as a copy with other values may have.
+        Raises ValueError for an amount that is not allowed, which is possible in a modified copy of a fault.
         """
         for fault in faults:
             if wrong := _wrong_amount(fault.kind, fault.amount):

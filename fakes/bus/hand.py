@@ -31,7 +31,7 @@ _PULL_S = 0.01
 
 
 _FASTEST_RAD_S = 200.0
-"""Greatest mean velocity of a movement [rad/s]; much more would break the simulated gears and hard stops."""
+"""Largest mean velocity of a movement [rad/s]; the simulated gears and hard stops would not withstand much more."""
 
 _MOST_TICKS = 1 << 20
 """Largest Present Position of a servo in either direction: 256 turns."""
@@ -90,8 +90,8 @@ class _Grip:
 class Hand:
     """The hand of one bus. Times are in seconds since the bus was created.
 
-    tell: called whenever a move, grip or release may have changed `busy`. While the hand is busy, it needs the bus's
-    ticks.
+    tell: called whenever a move, grip or release may have changed `busy`. While the hand is busy, the bus must call
+    `tick`.
     """
 
     def __init__(self, joints: Joints, plant: Plant, time: Callable[[], float], tell: Callable[[], None]) -> None:
@@ -113,10 +113,10 @@ class Hand:
         return frozenset(self._grips)
 
     def move(self, *moves: Move) -> None:
-        """Schedule moves, each `at` seconds from now.
+        """Schedule moves, each of which starts `at` seconds from now.
 
         Raises PlantError if the plant's joints cannot be held, ValueError for an ID that no servo has, and for a move
-        that starts now while its joint's torque is on. One that starts later is skipped if torque is on by then.
+        that starts now while its joint's torque is on. A move that starts later is skipped if torque is on by then.
         """
         for move in moves:
             if move.at == 0.0 and (driving := self._driving(self._joint_of(move))):
@@ -127,7 +127,7 @@ class Hand:
         self.schedule(*moves)
 
     def schedule(self, *moves: Move) -> None:
-        """Schedule moves as `move` does; one whose joint's torque is on when it should start is skipped."""
+        """Schedule moves as `move` does, but skip any move whose joint's torque is on when it should start."""
         now = self._time()
         free = {self._joint_of(move) for move in moves} - self._grips.keys()
         if moves and not isinstance(self._plant, CanBeHeld):

@@ -147,7 +147,7 @@ class Instructions:
                 delay_s, sender = servo.return_delay_s, servo.id
                 error, data = act(servo)
                 if wanted:
-                    # A reboot clears its Alert bit, and what is still wrong is found when it has booted.
+                    # A reboot clears the servo's Alert bit; once it has booted, it detects what is still wrong.
                     error |= servo.alert if now >= servo.ready_at else 0
                     answers.append((sender, delay_s, encode_status(sender, error, data)))
         self._line.send(self._overlaid(answers), now)

@@ -9,7 +9,7 @@ from hil.fakes.bus.uart import heard
 BITS_PER_BYTE = 10
 
 ROUNDING_S = 1e-9
-"""Two transmissions that overlap by less than this count as consecutive [s]."""
+"""Longest overlap of two transmissions that still count as consecutive [s]."""
 
 
 class Arriving(NamedTuple):

@@ -12,7 +12,7 @@ NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 PI = 3.1425
-"""Pi, rounded up: a bound must admit an angle that was rounded, such as 1.5708, 6.284 or 12.57 [rad]."""
+"""Pi, rounded up, so that bounds based on it accept rounded angles such as 1.5708, 6.284 or 12.57 [rad]."""
 
 Angle = Annotated[float, Field(ge=-4 * PI, le=4 * PI, allow_inf_nan=False)]
 

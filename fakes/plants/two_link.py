@@ -116,8 +116,9 @@ def _run(  # noqa: PLR0912, PLR0915
 ) -> State:
     """Integrate over `remaining` [s] in steps of at most `longest` [s] with commanded currents [A].
 
-    This is one long loop with local floats because a fake arm spends most of its time here: a function call per step
-    makes it take 1.5 times as long. A step in which a joint's velocity changes sign is split at that point (`cut`).
+    This is one long loop with local floats because a fake arm spends most of its computing time here: one function call
+    per step would make it take 1.5 times as long. A step in which a joint's velocity changes sign is split at that
+    point (`cut`).
 
     arm: `TwoLink._terms`. drives: `Motor.plain` of both motors. motors: None if both are plain, the only compiled case.
     """

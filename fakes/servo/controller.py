@@ -195,7 +195,7 @@ class Controller:
 
 
 def _shape(away: float, velocity: float, fastest: float, hardest: float) -> int:
-    """Return the bits of Moving Status that state the shape of the velocity profile for a move of `away` ticks.
+    """Return the bits of Moving Status that give the shape of the velocity profile for a move of `away` ticks.
 
     The profile is triangular if it does not reach its velocity limit.
 

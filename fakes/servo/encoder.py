@@ -56,7 +56,7 @@ class Reading:
         self._encoder = encoder
         self._noise = Random(seed) if encoder.noise_ticks else None
         self.is_perfect = encoder == PERFECT
-        """Whether its only error is rounding."""
+        """Whether the encoder's only error is rounding."""
 
     def steady(self, ticks: float) -> float:
         """Return the reading [ticks] without noise, before rounding, if a perfect encoder would read `ticks`."""

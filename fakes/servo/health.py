@@ -39,7 +39,7 @@ class Overload(Described):
 COOLING_K_S = 10.0
 """Rate at which a servo without [thermal] table cools after a fault has heated it [K/s].
 
-*Chosen*, so that a test need not wait long: a real servo takes minutes.
+This rate was chosen so that tests need not wait long; a real servo takes minutes.
 """
 
 

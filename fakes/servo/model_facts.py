@@ -22,7 +22,10 @@ Blocks = tuple[tuple[int, int, int], ...]
 
 @dataclass(frozen=True, slots=True)
 class RegisterFacts:
-    """Register properties that control tables do not state. `limits` is None if any value that fits is accepted."""
+    """Register properties that control tables do not state.
+
+    `limits` is None if the register accepts every value that fits into its bytes.
+    """
 
     initial: int = 0
     limits: tuple[int, int] | None = None
@@ -283,7 +286,9 @@ X_INITIAL: Mapping[str, Mapping[str, int]] = {
     "XH540-V270": _X_INITIAL,
     "XW540-H260": _X_INITIAL,
 }
-"""Factory values in the EEPROM of X models whose ranges are unknown here; of the 24 V models, only what all share."""
+"""Factory values in the EEPROM of X models whose ranges are unknown here; for the 24 V models, only values that all of
+them share.
+"""
 
 _STRENGTH = (0, 1023)
 

@@ -24,7 +24,8 @@ _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 _REALTIME_TICK_WRAP = 32_768
 _REVERSE = 0x01  # bit of Drive Mode
 _MOST_HOMING_TICKS = 1024
-"""A Homing Offset beyond this is ignored in Position Control Mode (e-Manual, Homing Offset)."""
+"""Largest Homing Offset [ticks] that Position Control Mode applies; it ignores larger ones (e-Manual, Homing Offset).
+"""
 _CLEAR_TURNS = b"\x01DXL\x22"
 
 # Realtime Tick, Moving, Moving Status, Present PWM; Present Current (or Load), Velocity, Position; the trajectories.
@@ -70,7 +71,7 @@ class Present:
         self._imperfect = noise is not None or senses_supply
         self._booted_at = 0.0
         self._turn_ticks = 0
-        """Offset that the servo adds to its encoder count [ticks]; Reverse Mode mirrors the sum."""
+        """Offset that the servo adds to its encoder count [ticks]; Reverse Mode negates the sum."""
         self._shift = 0
         self._reversed = False
         self._moving_threshold = 0

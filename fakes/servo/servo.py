@@ -432,7 +432,7 @@ class EmulatedServo(Powered):
         moves = self._torque and bool(self.model.operating_modes)
         most = min(memory.get("PWM Limit", FULL_PWM), abs(memory.get("Goal PWM", FULL_PWM)))
         self._is_limited = self._voltage_limited or (self._mode == CURRENT_MODE and most < FULL_PWM)
-        """Whether the supply, PWM Limit or Goal PWM may limit the current of current mode."""
+        """Whether the supply, PWM Limit or Goal PWM may limit the current in current mode."""
 
         self.needs_ticks = self.health.changes or (moves and (self._mode != CURRENT_MODE or self._is_limited))
         """Whether the servo's state changes with time alone, so that the bus must call `tick`."""

@@ -14,8 +14,8 @@ from hil.setup.finding import Finding, Level
 from hil.setup.preflight import check_arm
 
 _ALWAYS_HELD_HZ = 150.0
-"""Rate [Hz] from which the stabiliser's delay does not matter; it is then not checked, since loading the pilot for this
-takes a second.
+"""Lowest rate [Hz] at which the stabiliser's delay certainly does not matter. From this rate on, it is not checked,
+because loading the pilot for the check takes a second.
 """
 
 __all__ = ["CheckReport", "Finding", "Level", "check"]

@@ -1,4 +1,4 @@
-"""The types that the public functions accept as a configuration. This module imports little else."""
+"""The types that the public functions accept as a configuration. This module imports only what they need."""
 
 from os import PathLike
 from pathlib import Path

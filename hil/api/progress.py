@@ -71,4 +71,4 @@ def forgiving(listener: OnProgress) -> OnProgress:
 
 
 def ignore(_: Progress) -> None:
-    """Do nothing with a progress report."""
+    """Ignore a progress report."""

@@ -49,7 +49,7 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
             comment(link, f"excludes links moved by held joints, whose inertia was not identified: {', '.join(apart)}")
         if share < 1.0:
             reduced.append(
-                f"the full inertia that the description gives {', '.join(joint.movable)}; the file has "
+                f"the full inertia that the description gives for {', '.join(joint.movable)}; the file has "
                 f"{100 * share:.2g} % of it, because more would leave no physically possible body for {joint.link}"
             )
             for name in apart:

@@ -63,7 +63,7 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
     said = []
     if found.misfit > FAR:
         said.append(
-            "the identified values exactly: no physically consistent links have them, and the nearest ones are "
+            "the exact identified values: no physically consistent links have them, and the nearest ones are "
             f"{found.misfit:.1f} standard errors away"
         )
     bodies = tuple(_body(row) for row in found.links)

@@ -1,9 +1,10 @@
 """Arms drawn from the posterior of an identification, for domain randomisation: one file per arm, one table for all.
 
-The parameters are drawn from a normal distribution with the estimated covariance. One factor common to all torques
-is also drawn, because the torque constant is known far less accurately than anything else. The motion reveals the
-ratios of the joints' constants, so only a common factor remains; its uncertainty is that of the best-known joint's
-constant. The torque per goal (in A or V) is scaled with it, so that all drawn arms respond equally to the same goals.
+The parameters are drawn from a normal distribution with the estimated covariance. One factor common to all torques is
+also drawn, because the torque constant is known far less accurately than anything else. The motion reveals the ratios
+of the joints' constants, so only a common factor remains unknown; its uncertainty is that of the best-known joint's
+constant. The torque per goal (in A or V) is scaled with it, so that all drawn arms respond to the same goals in the
+same way.
 """
 
 from collections.abc import Sequence

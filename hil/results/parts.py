@@ -195,7 +195,7 @@ class TriedModel:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelChoice:
-    """The model chosen with friction = "auto", and its gain and cost.
+    """The model chosen with friction = "auto", and its benefit and cost.
 
     error_divided_by: prediction error of the model with the fewest parameters divided by that of the chosen one.
     standard_errors_times: factor by which the standard errors grew; None if they were not compared.

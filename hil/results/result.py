@@ -9,7 +9,7 @@ validation   open-loop prediction of another multisine and the fitted one, relat
              relative to rounding, whiteness, conditioning; noise, distortion and model error in encoder steps
 verdict      whether to trust the result, the weakest parameter, and the reasons as sentences
 warnings     problems of the recording, as sentences
-model_choice with friction = "auto": the models tried, the one chosen, its gain and cost
+model_choice with friction = "auto": the models tried, the one chosen, its benefit and cost
 timing       how well the stream kept its deadlines, and the duration of the estimation
 arm          data needed to use the model: gravity, rest pose, and, for each joint, name, servo, mode, limits, torque
              per goal [N m/A, or N m/V in pwm mode]

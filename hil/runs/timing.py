@@ -70,7 +70,7 @@ def _sent(samples: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def _round_trip(samples: NDArray[np.void]) -> Array:
-    """Time from write to reply [s], in the shape of `samples`; 0 where nothing was written."""
+    """Time from write to reply [s], with the shape of `samples`; 0 where nothing was written."""
     before: Array = samples["time_before_write"]
     after: Array = samples["time_after_read"]
     return after - before

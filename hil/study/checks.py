@@ -60,7 +60,7 @@ def arm_toml(study: Study, run: int) -> str:
 
 
 def checked_arm(study: Study, run: int) -> Config:
-    """The arm's configuration for this run. Raises ConfigError, whose message names the run and its values."""
+    """The arm's configuration for this run. Raises ConfigError; its message gives the run and its values."""
     try:
         return parse_config(arm_toml(study, run), arm_path(study))
     except ConfigError as error:

@@ -56,7 +56,7 @@ class Dataset:
         return pa.concat_tables(_alike(parts), promote_options="permissive").sort_by("run")
 
     def compact(self) -> None:
-        """Replace all parts by a single one in the order of the runs, so that every reader sees one schema."""
+        """Replace all parts by a single one in the order of the runs, so that every reader sees the same schema."""
         old = self._parts()
         table = self.table()
         whole = self.folder / f"part-{self._next:06d}.parquet"

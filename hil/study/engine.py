@@ -41,7 +41,8 @@ _NO_DASK = "hil study needs Dask: pip install 'hil[study]'."
 _CONNECT_S = 10.0
 _MOST_DEATHS = 10
 """Number of worker losses after which a run counts as failed, since a run that needs too much memory kills every worker
-that tries it."""
+that attempts it.
+"""
 
 
 @contextmanager
@@ -65,7 +66,7 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
         except (OSError, TimeoutError, ValueError) as error:
             raise ConfigError(
                 f"--scheduler {scheduler}: no Dask scheduler answers there ({type(error).__name__}). Start one with "
-                "`dask scheduler`, workers with `dask worker ADDRESS --nthreads 1`."
+                "`dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`."
             ) from error
         with client:
             _check_versions(client, scheduler)
@@ -148,7 +149,7 @@ def _package_versions() -> dict[str, str]:
 
 
 def _check_versions(client: "Client", scheduler: str | None) -> None:
-    """Refuse workers with other package versions, which would give different numbers."""
+    """Refuse workers with other package versions, since their results could differ."""
     try:
         client.wait_for_workers(1, timeout=600 if scheduler == "slurm" else 60)
     except TimeoutError as error:

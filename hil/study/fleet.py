@@ -1,4 +1,4 @@
-"""Comparison of many arms: how much those of one type differ, and which ones are outliers."""
+"""Comparison of many arms: how much arms of one type differ, and which of them are outliers."""
 
 from collections import Counter
 from dataclasses import dataclass

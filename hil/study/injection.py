@@ -1,4 +1,6 @@
-"""Run an experiment with faults; report whether it was stopped, why, after what delay, and how far the arm moved."""
+"""Run an experiment with faults; report whether it was stopped, why, after what delay, and how far the arm overshot its
+limits.
+"""
 
 from pathlib import Path
 from typing import Any

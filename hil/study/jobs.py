@@ -22,11 +22,15 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _AHEAD = 8
-"""Jobs given to each worker beyond its current one: enough that no worker waits, few enough to limit memory use."""
+"""Number of jobs given to each worker in addition to its current one: enough to keep it busy, few enough to limit
+memory use.
+"""
 
 
 _TASK_S, _MOST_IN_A_TASK = 0.1, 50
-"""Jobs are combined into tasks of up to this duration [s] and number of jobs: each task has an overhead of a few ms."""
+"""Largest duration of a task [s] and its largest number of jobs; jobs are combined because each task has an overhead of
+a few ms.
+"""
 
 
 _COUNTED_EVERY_S = 1.0

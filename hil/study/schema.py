@@ -166,7 +166,7 @@ class Study(_Table):
 
 
 def load_study(path: Path) -> Study:
-    """Read and check the file. Raises ConfigError; its message gives file, key, value and allowed values."""
+    """Read and check the file. Raises ConfigError; its message gives the file, key, value and allowed values."""
     try:
         values = load_toml(path)
     except TomlFileError as error:

@@ -87,7 +87,9 @@ class Conversation(SingleInstructions):
         self._follow(servo)
 
     def secondary(self) -> None:
-        """At its Secondary ID, a servo obeys writes to RAM, but not to EEPROM, and does not answer (x/shadow_id)."""
+        """Write to a Secondary ID: a servo obeys if the register is in RAM, but not if it is in EEPROM, and does not
+        answer (x/shadow_id).
+        """
         servo = self.any_servo()
         if servo.rules.torque:
             return
@@ -205,7 +207,7 @@ class Conversation(SingleInstructions):
             self.settle(servo, [row.address])
 
     def read_all(self) -> None:
-        """A broadcast Read is not answered."""
+        """Send a broadcast Read, which no servo answers."""
         self.ask("read_all", packet(BROADCAST, codec.READ, b"\x84\0\4\0"), [])
 
     # Bytes that look like a header, and bytes that are not packets
@@ -227,7 +229,7 @@ class Conversation(SingleInstructions):
         self._compare_indirect(servo)
 
     def damaged(self) -> None:
-        """A wrong CRC is answered with the CRC error and changes nothing."""
+        """Send a packet with a wrong CRC; the servo answers with the CRC error and changes nothing."""
         servo = self.any_servo()
         row = self.row(servo)
         body = row.address.to_bytes(2, "little") + self.value(row)

@@ -109,7 +109,7 @@ class Host:
         return self.random.choice([row for row in rows if row.low is not None or not writable])
 
     def value(self, row: Row) -> bytes:
-        """A value for a register, mostly in range."""
+        """A value for a register, usually within its range."""
         low, high = row.low or 0, row.high if row.high is not None else 1
         edges = (low, high, low - 1, high + 1, row.initial or 0)
         number = self.random.choice(edges) if self.random.random() < 0.5 else self.random.randint(low, high)
@@ -126,7 +126,7 @@ class Host:
                 self.look(servo, row)
 
     def look(self, servo: Servo, row: Row) -> None:
-        """Read one register and compare it with what it must hold."""
+        """Read one register and compare its value with the expected one."""
         body = row.address.to_bytes(2, "little") + row.size.to_bytes(2, "little")
         got = self.ask(f"read {row.address}", packet(servo.id, codec.READ, body), self.answers(servo, {FINE}, 1))
         if got:

@@ -30,14 +30,14 @@ ERRORS = set(range(1, 8))
 
 
 class Still:
-    """Joints that nothing moves."""
+    """Joints that never move."""
 
     def __init__(self, joints: int) -> None:
         self.joints = joints
         self.position = self.velocity = self.current = [0.0] * joints
 
     def advance(self, until: float, current: object) -> None:
-        """Nothing moves."""
+        """Do nothing."""
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Instructions to one servo, and their broadcasts to all servos."""
+"""Instructions to one servo, and the same instructions broadcast to all servos."""
 
 from benchmarks.bus import codec
 from benchmarks.bus.codec import BROADCAST, Status, packet
@@ -368,7 +368,7 @@ class SingleInstructions(Host):
         servo.rules.held[LEVEL] = codec.statuses(got)[0].data[0] if got else 0
 
     def _follow(self, servo: Servo) -> None:
-        """Ping the servo at the baud rate that it must have, and return it to the rate of the others."""
+        """Ping the servo at the baud rate that it should now have, and return it to the rate of the others."""
         if BAUD_RATES[servo.rules.held[BAUD]] == 1_000_000:
             self.found(servo)
             return
