@@ -160,12 +160,19 @@ def _refused(left: float, held_out: Array | None, evidence: SegmentEvidence) -> 
     """Name the rule that makes the verdict "no", and a remedy unless faults of the recordings are already reported."""
     if evidence.faulty or not _is_refused(left, held_out, evidence):
         return ()
-    remedy = "" if evidence.spoiled else ": check the columns, their units, and whether anything touched the arm"
+    remedy = "" if evidence.spoiled else f": {_remedy(left)}"
     if held_out is None:
         rule = f"Without that check, a residual above {MUCH_LEFT:g} times the noise"
     else:
         rule = f"An error above {percent(_largest_error(left))}"
     return (f'{rule} makes the verdict "no"{remedy}.',)
+
+
+def _remedy(left: float) -> str:
+    """Say what to do about a large prediction error. left: residual over noise of the fit to the whole recording."""
+    if left <= NEARLY_EXPLAINED:
+        return "half of this motion does not determine the model. Record longer, with larger or faster motion"
+    return "check the columns, their units, and whether anything touched the arm"
 
 
 def _left(estimate: ShootingEstimate, evidence: SegmentEvidence) -> str:

@@ -97,7 +97,7 @@ def choose_by_shooting(
     if plain is None:
         plain = search.fit(Model(joints, "coulomb", drive), options=QUICK)
     if plain is None:
-        raise ConvergenceError("no friction model could be fitted: check the recording and its units")
+        raise ConvergenceError("no friction model could be fitted: check order, signs, units and zeros of the columns")
     best = search.grown(plain)
     return search.judged(plain, best)
 
