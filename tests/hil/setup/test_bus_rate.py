@@ -37,6 +37,18 @@ def test_a_slower_bus_does_not_and_says_so(tmp_path: Path) -> None:
     assert not enough and possible < 150
 
 
+@pytest.mark.parametrize(("delay_ms", "least"), [(8, 90), (16, 45), (60, 12)])
+def test_late_replies_of_a_slow_adapter_are_not_taken_for_the_next_ones(
+    arm_file: ArmFile, delay_ms: int, least: int
+) -> None:
+    slow = arm_file(("adapter_latency_us = 60.0", f"adapter_latency_us = {delay_ms}e3"))
+    findings = {each.what: each for each in hil.check(slow).findings}
+    assert [each for each in findings.values() if each.level == "stop"] == [findings["rate"]]
+    assert findings["adapter"].found == f"delays replies by {delay_ms}.0 ms, which limits the rate"
+    possible, _ = rate_of(slow)
+    assert least <= possible <= 1000 / delay_ms
+
+
 @pytest.mark.parametrize(("rate", "is_said"), [(400, False), (840, False), (880, True)])
 def test_a_rate_that_leaves_no_time_to_read_goals_back_is_said(arm_file: ArmFile, rate: int, is_said: bool) -> None:
     findings = hil.check(arm_file(("rate = 400.0 ", f"rate = {rate}.0 "))).findings
