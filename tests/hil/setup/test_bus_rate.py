@@ -10,7 +10,8 @@ from typing import cast
 import pytest
 
 import hil
-from benchmarks.bus.held_rate import six_servos
+from benchmarks.bus.held_rate import configured, six_servos
+from benchmarks.bus.socket_line import socket_line
 from hil.drivers.bus import ServoBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.setup import bus_rate
@@ -30,6 +31,12 @@ def rate_of(path: Path) -> tuple[int, bool]:
 def test_six_servos_with_shadows_hold_400_hz_at_1_mbaud(tmp_path: Path) -> None:
     possible, enough = rate_of(six_servos(tmp_path, "1_000_000"))
     assert enough and possible >= 400
+
+
+def test_the_benchmarks_socket_leads_to_the_six_servos(tmp_path: Path) -> None:
+    path = six_servos(tmp_path)
+    with socket_line(path), ServoBus.open(configured(path, fast=True).bus) as bus:
+        assert len(bus.read_positions()) == 4 and len(bus.drives) == 6
 
 
 def test_a_slower_bus_does_not_and_says_so(tmp_path: Path) -> None:
