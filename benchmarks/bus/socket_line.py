@@ -25,8 +25,10 @@ from hil.drivers.port import DescriptorPort
 from hil.fakes.description import load_fake
 from hil.fakes.pty_server import PtyServer
 
+ROOT = Path(__file__).parents[2]
 DEVICE = "socket"
 BAUD = 1_000_000
+_SERVE = "import sys; from benchmarks.bus.socket_line import serve; serve(*sys.argv[1:])"
 
 
 class SocketServer(PtyServer):
@@ -74,8 +76,8 @@ def socket_line(config: Path) -> Iterator[None]:
     """
     ours, theirs = socket.socketpair()
     ours.setblocking(False)
-    command = [sys.executable, __file__, str(config), str(theirs.fileno())]
-    with subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdout=subprocess.PIPE) as process:
+    command = [sys.executable, "-c", _SERVE, str(config), str(theirs.fileno())]
+    with subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdout=subprocess.PIPE, cwd=ROOT) as process:
         theirs.close()
         prioritise(process.pid)
         assert process.stdout is not None
@@ -88,12 +90,9 @@ def socket_line(config: Path) -> Iterator[None]:
             ours.close()
 
 
-def main() -> None:
-    server = SocketServer(Path(sys.argv[1]), int(sys.argv[2]))
+def serve(config: str, descriptor: str) -> None:
+    """Serve this arm on this end of a socket pair until SIGTERM."""
+    server = SocketServer(Path(config), int(descriptor))
     signal.signal(signal.SIGTERM, lambda *_: server.stop())
     print("ready", flush=True)
     server.serve()
-
-
-if __name__ == "__main__":
-    main()
