@@ -120,7 +120,7 @@ class FakeSerial(SerialBase):
             raise ValueError(f"the baud rate must be positive, not {self.baudrate}")
         if self._bus is not None:
             self._bus.baud = self.baudrate
-        self._is_understood = self._bytesize == serial.EIGHTBITS and self._parity in _LIKE_NO_PARITY
+        self._is_understood = self.bytesize == serial.EIGHTBITS and self.parity in _LIKE_NO_PARITY
 
     def read(self, size: int = 1) -> bytes:
         """Return up to `size` bytes, waiting on `clock` for at most the port's timeout.
