@@ -144,13 +144,20 @@ class ServoBus(TorqueSwitch):
         answers = zip(self._drives, self._last_answers, strict=False)
         return {drive for drive, answer in answers if answer is None or len(answer) == 1}
 
+    def learn_latency(self) -> None:
+        """Lower the adapter's latency timer, and measure whether the adapter is slower than its kind; raises PortLost.
+
+        Until then, replies of a slow adapter may be taken for those to the next request.
+        """
+        self.port.lower_latency()
+        learn_latency(next(iter(self._servos.values())))
+
     def check_identity(self) -> None:
         """Ping every servo and compare its model and firmware with the configuration; raises NoReply, WrongModel.
 
         Also lowers the adapter's latency timer and determines whether the adapter is slower than expected for its type.
         """
-        self.port.lower_latency()
-        learn_latency(next(iter(self._servos.values())))
+        self.learn_latency()
         for joint, servo in self._servos.items():
             number = servo.ping()
             if number != servo.table.number:

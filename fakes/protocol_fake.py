@@ -31,6 +31,8 @@ from hil.fakes.plants.errors import PlantError
 
 SCHEME = "fake://"
 REAL_TIME = "?time=real"
+_LIKE_NO_PARITY = (serial.PARITY_NONE, serial.PARITY_MARK)
+"""Parities that a receiver without parity understands: it takes the bit of mark parity for a stop bit."""
 
 
 class _Unplugged(serial.SerialException):
@@ -62,6 +64,7 @@ class FakeSerial(SerialBase):
         self.clock: Clock = clock or VirtualClock()
         self._bus: FakeBus | None = None
         self._pulls = 0
+        self._is_understood = True
         super().__init__(port, *args, **kwargs)  # type: ignore[arg-type]  # pyserial's long list of settings
 
     @property
@@ -112,11 +115,12 @@ class FakeSerial(SerialBase):
         self.is_open = False
 
     def _reconfigure_port(self, force_update: bool = False) -> None:
-        """Apply the baud rate, the only setting with an effect here. The frame format is always 8N1."""
+        """Apply the baud rate and the frame format; the other settings have no effect here."""
         if self.baudrate <= 0:
             raise ValueError(f"the baud rate must be positive, not {self.baudrate}")
         if self._bus is not None:
             self._bus.baud = self.baudrate
+        self._is_understood = self.bytesize == serial.EIGHTBITS and self.parity in _LIKE_NO_PARITY
 
     def read(self, size: int = 1) -> bytes:
         """Return up to `size` bytes, waiting on `clock` for at most the port's timeout.
@@ -137,8 +141,11 @@ class FakeSerial(SerialBase):
         return taken
 
     def write(self, data: bytes | bytearray) -> int:  # type: ignore[override]  # pyserial's stub allows any buffer
-        """Put bytes on the wire and return immediately, like a buffered driver."""
-        self._open_bus().write(bytes(data))
+        """Put bytes on the wire and return immediately, like a buffered driver.
+
+        Servos reject bytes with another frame than 8N1. Zeros stand for them: they take as long and contain no packet.
+        """
+        self._open_bus().write(bytes(data) if self._is_understood else bytes(len(data)))
         return len(data)
 
     def wait(self, seconds: float) -> None:

@@ -120,7 +120,7 @@ class PtyServer:
             bus.damaged_packets,
             bus.collisions,
             self._overruns,
-            len(bus.faults.happened),
+            bus.faults.count,
             self._late_max_s,
             self._clock.lost_s,
         )

@@ -1,15 +1,16 @@
 """Whether an arm of four joints, two of which have a second servo, sustains 400 Hz at 1 Mbaud.
 
-    python benchmarks/bus/held_rate.py [--seconds 20] [--rounds 3] [--fast | --plain] [--json]
+    python benchmarks/bus/held_rate.py [--seconds 20] [--rounds 3] [--fast | --plain] [--pty] [--json]
 
 The arm is held at rest with torque on while the program does the same work as during an experiment: deadlines,
-read-backs, exchanges with slow reads and status reads, checks, and recording. The servos run in another process, `hil
-fake --pty`, which delays each byte as the wire would. Both processes ask for real-time scheduling, each on its own
-core. However, the kernel forwards the bytes of a pty in a thread of ordinary priority, and virtual machines stall, so
-run this on a quiet machine only. The computer's load is printed. After each round, two loops with the same deadlines
-and real-time settings show how many deadlines are missed because of the computer and the pty alone. The first loop only
-waits. The second writes the bytes of an exchange and reads the reply from a responder in C, which delays each byte as
-the wire would; it has no driver, checks, slow reads or read-backs.
+read-backs, exchanges with slow reads and status reads, checks, and recording. The servos run in another process, which
+takes as long for each byte as the wire would. Both processes ask for real-time scheduling, each on its own core. They
+are connected by a socket, which wakes the reader at once. With --pty it is a terminal, as with `hil fake --pty`, whose
+bytes the kernel forwards in a thread of ordinary priority: other programs then delay them by milliseconds. Virtual
+machines also stall. The load is printed. After each round, a loop with the same deadlines and real-time settings that
+only waits shows how many deadlines the computer misses on its own. With --pty, a second one writes the bytes of an
+exchange and reads the reply from a responder in C, which takes as long for each byte as the wire would; it has no
+driver, checks, slow reads or read-backs.
 
 missed: number of missed deadlines. slow: number of those caused by the computer or the pty, because the preceding
 exchange took over 1 ms longer than the wire needs. lost: number of samples in which a reply is missing.
@@ -33,6 +34,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 import numpy as np
 
 from benchmarks.bus.served_pty import responder_binary, served_pty
+from benchmarks.bus.socket_line import DEVICE, socket_line
 from benchmarks.bus.stream_cycle import fake_pty
 from benchmarks.machine import machine
 from hil.config.schema import Config, load_config
@@ -113,7 +115,7 @@ def _behind_slow_ones(rows: Any, is_missed: Any, slow_s: float) -> int:
     count, is_slow = 0, False
     for took, missed_it in zip(rows["time_after_read"] - rows["time_before_write"], is_missed, strict=True):
         if missed_it:
-            count += is_slow
+            count += bool(is_slow)
         else:
             is_slow = took > slow_s
     return count
@@ -169,6 +171,19 @@ def configured(path: Path, *, fast: bool) -> Config:
 
 
 def measure(seconds: float, rounds: int, reads: tuple[bool, ...]) -> list[dict[str, Any]]:
+    """Measure over a socket."""
+    figures = []
+    with tempfile.TemporaryDirectory() as name:
+        path = six_servos(Path(name))
+        for _ in range(rounds):
+            for fast in reads:
+                with socket_line(path):
+                    figures.append(held(DEVICE, configured(path, fast=fast), seconds, Path(name)))
+                figures[-1]["nothing_missed"] = bare(seconds, None, fast=fast)
+    return figures
+
+
+def measure_on_pty(seconds: float, rounds: int, reads: tuple[bool, ...]) -> list[dict[str, Any]]:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         path = six_servos(folder)
@@ -189,21 +204,23 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="one JSON object and nothing else")
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--pty", action="store_true", help="over a terminal instead of a socket")
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--fast", dest="reads", action="store_const", const=(True,), default=(True, False))
     kind.add_argument("--plain", dest="reads", action="store_const", const=(False,))
     options = parser.parse_args()
-    figures = measure(options.seconds, options.rounds, options.reads)
+    figures = (measure_on_pty if options.pty else measure)(options.seconds, options.rounds, options.reads)
     if options.json:
         print(json.dumps({"machine": machine(), "rounds": figures}))
         return
-    print(f"Six servos at {RATE:g} Hz and 1 Mbaud, fake bus on a pty. {machine()}.")
+    line = "pty" if options.pty else "socket"
+    print(f"Six servos at {RATE:g} Hz and 1 Mbaud, fake bus on a {line}. {machine()}.")
     for each in figures:
         read = "Fast Sync Read" if each["fast"] else "Sync Read"
         print(
             f"{read:15s} longest exchange on the wire {each['wire_ms']:.2f} ms: missed {each['missed']} of "
             f"{each['samples']} ({each['slow']} slow), by a loop without bus {each['nothing_missed']}, by one of bytes "
-            f"{each['bytes_missed']}; lost {each['lost']}, late {each['late_ms']}, took {each['took_ms']}, "
+            f"{each.get('bytes_missed', '-')}; lost {each['lost']}, late {each['late_ms']}, took {each['took_ms']}, "
             f"work {each['work_us']}, load {each['load']}{each['stopped'] and '; stopped: '}{each['stopped']}"
         )
 

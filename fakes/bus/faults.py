@@ -141,6 +141,9 @@ REPLY_FAULTS = frozenset(
 )
 INSTRUCTION_FAULTS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTRUCTION})
 
+MOST_REMEMBERED = 100_000
+"""`Faults.happened` holds up to twice this number of faults, and always at least the last ones of this number."""
+
 
 class Fault(Described):
     """One injected fault (immutable). `servo` is the servo's bus ID when the fault begins; None means all servos."""
@@ -204,14 +207,16 @@ Effect = Callable[[Fault], None]
 
 
 class Faults:
-    """The faults of one bus: pending ones, active ones, and a record of those that took effect (`happened`).
+    """The faults of one bus: pending ones, active ones, and a record of those that took effect.
 
-    begin, end: apply a fault to the servos, and undo it. catch_up: advances the bus to the present, so that adding or
-    clearing a fault does not take effect at the time of the last packet.
+    happened: those that took effect; of a long run, the latest (see `MOST_REMEMBERED`). count: number of all of them.
+    begin, end: apply a fault to the servos, and undo it. catch_up: advances the bus to the present, so that what is
+    added or cleared now does not take effect at the time of the last packet.
     """
 
     def __init__(self, seed: int, begin: Effect, end: Effect, catch_up: Callable[[], None] = lambda: None) -> None:
         self.happened: list[Happened] = []
+        self.count = 0
         self.next_change = math.inf
         """Time at which the next fault begins or ends [s since the bus was created]."""
         # Active faults that affect reply packets, instruction packets, and how servos answer.
@@ -281,8 +286,14 @@ class Faults:
             return False
         if fault.probability < 1.0 and self.random.random() >= fault.probability:
             return False
-        self.happened.append(Happened(now, fault.kind, servo_id))
+        self._note(now, fault.kind, servo_id)
         return True
+
+    def _note(self, now: float, kind: FaultKind, servo_id: int | None) -> None:
+        self.count += 1
+        self.happened.append(Happened(now, kind, servo_id))
+        if len(self.happened) >= 2 * MOST_REMEMBERED:
+            del self.happened[:MOST_REMEMBERED]
 
     def _start(self, fault: Fault, now: float) -> None:
         self._lasting.append(fault)
@@ -295,7 +306,7 @@ class Faults:
         elif fault.repeats_every < math.inf:
             self._repeats.append((now, fault))
         elif fault.probability >= 1.0 or self.random.random() < fault.probability:
-            self.happened.append(Happened(now, fault.kind, fault.servo))
+            self._note(now, fault.kind, fault.servo)
             self._begin(fault)
         else:
             self._lasting.remove(fault)

@@ -78,9 +78,6 @@ _READ_ONLY = _Facts(writable=False)
 NEVER = 256
 """A firmware version that no servo has, for features that no firmware supports."""
 
-REVERSES_ALL = ("XM540", "XH540", "XD540", "XW540", "XW430")
-"""Series whose Reverse Mode inverts velocity, current and PWM as well as position (e-Manual, Drive Mode, by series)."""
-
 X_SERIES: Mapping[str, RegisterFacts] = {
     "Model Number": _READ_ONLY,
     "Model Information": _READ_ONLY,

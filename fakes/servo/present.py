@@ -54,9 +54,7 @@ class Present:
         self.zero_ticks = zero_ticks
         self.direction = direction
         self.sign = direction
-        """+1 or -1: sign of the servo's current, velocity and PWM relative to the joint's."""
-        self.position_sign = direction
-        """+1 or -1: sign of the servo's position relative to the joint's; Reverse Mode inverts it on every model."""
+        """+1 or -1: sign of the servo's position, velocity, current and PWM relative to the joint's."""
         self.jump_ticks = 0
         """Encoder error injected by a fault [ticks]."""
         self._memory = memory
@@ -85,8 +83,7 @@ class Present:
         share: returns the bridge's duty cycle for a current [A] and a velocity [rad/s].
         """
         self._reversed = bool(self._memory.get("Drive Mode") & _REVERSE)
-        self.position_sign = -self.direction if self._reversed else self.direction
-        self.sign = self.position_sign if self._model.reverses_all else self.direction
+        self.sign = -self.direction if self._reversed else self.direction
         self._moving_threshold = self._memory.get("Moving Threshold")
         self._share = share
         self._shift_changed()

@@ -18,7 +18,6 @@ from hil.fakes.servo.model_facts import (
     FACTS,
     NEVER,
     OTHER_SERIES,
-    REVERSES_ALL,
     X_INITIAL,
     X_SERIES,
     Blocks,
@@ -69,8 +68,6 @@ class EmulatedModel:
     """Voltage per velocity of the output shaft [V s/rad]."""
     senses_supply: bool
     indirect: Blocks
-    reverses_all: bool
-    """Whether Reverse Mode inverts velocity, current and PWM as well as position."""
     registers: Mapping[str, Register]
 
 
@@ -136,7 +133,6 @@ def _x_series(name: str, facts: ModelFacts, indirect: Blocks) -> EmulatedModel:
         back_emf_v_s=facts.motor.back_emf_v_s,
         senses_supply=facts.senses_supply,
         indirect=indirect,
-        reverses_all=name.startswith(REVERSES_ALL),
         registers={register.name: register for register in sorted(registers, key=lambda r: r.address)},
     )
 
@@ -182,7 +178,6 @@ def _unknown(name: str) -> EmulatedModel:
         back_emf_v_s=1.0,
         senses_supply=False,
         indirect=(),
-        reverses_all=False,
         registers=registers,
     )
 

@@ -214,7 +214,7 @@ class EmulatedServo(Powered):
             return
         if self._mode != CURRENT_MODE or self._is_limited:
             ticks = self.present.ticks(position)
-            sign = self.present.position_sign if self._mode in POSITION_MODES else self.present.sign
+            sign = self.present.sign
             self.motor_current_a = sign * self.controller.motor_current(
                 self.model, self.supply_v, ticks, sign * velocity
             )

@@ -20,7 +20,7 @@ def measured_bus(arm: ArmAnswers, path: Path) -> tuple[MeasuredBus | None, str]:
     fakes.register_for(config.url)
     try:
         with ServoBus.connect(config.bus) as bus:
-            bus.port.lower_latency()
+            bus.learn_latency()
             modes = measure_modes(bus)
             mode, rate = choose_mode(bus, modes, RATES)
     except DriverError as error:

@@ -39,6 +39,7 @@ def check_arm(config: Config) -> Iterator[Finding]:
         yield from _torque_of_pilot(config)
         yield from _described(config)
         yield _latency_timer(bus)
+        yield from _slow_adapter(bus)
         yield from _others(config, bus)
         all_well = True
         for joint_config, joint in zip(config.joints, bus.joints, strict=True):
@@ -114,6 +115,19 @@ def _latency_timer(bus: ServoBus) -> Finding:
         return Finding(Level.OK, url, what, found)
     level = Level.STOP if before_ms >= FACTORY_MS else Level.WARNING
     return Finding(level, url, what, f"{before_ms} ms; {WANTED_MS} ms is needed", f"Type: {command_to_set(file)}")
+
+
+def _slow_adapter(bus: ServoBus) -> Iterator[Finding]:
+    """Report an adapter that is slower than its kind; all later timeouts allow for its delay."""
+    what = "adapter"
+    try:
+        bus.learn_latency()
+    except DriverError as error:
+        yield Finding(Level.WARNING, bus.port.url, what, "delay not measured", str(error))
+        return
+    if bus.port.latency_measured:
+        found = f"delays replies by {1e3 * bus.port.off_wire:.1f} ms, which limits the rate"
+        yield Finding(Level.OK, bus.port.url, what, found)
 
 
 def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:

@@ -183,7 +183,7 @@ class MockMotors:
         if address == _PRESENT_POSITION:
             self._stand(servo, value)
         else:
-            servo.memory._defined.update(range(address, address + length))  # where it has no register too
+            servo.memory._readable.add((address, length))  # where it has no register too
             servo.memory.data[address : address + length] = (value % (1 << 8 * length)).to_bytes(length, "little")
             servo._derive()
 

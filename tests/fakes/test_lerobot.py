@@ -9,7 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, GroupSyncRead, PacketHandler, PortHandler
 
+from tests.fakes.lerobot_adaptor import MockMotors
 from tests.support.paths import ROOT
 
 FOLDER = os.environ.get("LEROBOT_TESTS", "")
@@ -48,3 +50,28 @@ def test_lerobots_own_tests(tmp_path: Path) -> None:
     failed = [line.split("::")[1].split(" ")[0] for line in done.stdout.splitlines() if line.startswith("FAILED")]
     assert set(failed) <= set(NO_SERVO_WOULD), done.stdout[-4000:]
     assert " passed" in done.stdout, done.stdout + done.stderr
+
+
+def test_the_adaptors_servos_reply_as_its_stubs_say() -> None:
+    """What LeRobot's tests need from the adaptor, without LeRobot."""
+    motors, handler = MockMotors(), PacketHandler(2.0)
+    motors.open()
+    try:
+        port = PortHandler(motors.port)
+        assert port.openPort() and port.setBaudRate(1_000_000)
+        undefined = motors.build_read_stub(42, 4, 3, 1337)
+        assert handler.read4ByteTxRx(port, 3, 42) == (1337, COMM_SUCCESS, 0)
+        positions = motors.build_sequential_sync_read_stub(132, 4, {1: [351, 42], 2: [28, 3600]})
+        group = GroupSyncRead(port, handler, 132, 4)
+        assert group.addParam(1) and group.addParam(2)
+        for expected in ([351, 28], [42, 3600]):
+            assert group.txRxPacket() == COMM_SUCCESS
+            assert [group.getData(servo, 132, 4) for servo in (1, 2)] == expected
+        written = motors.build_write_stub(20, 4, 2, -5)
+        assert handler.write4ByteTxRx(port, 2, 20, 2**32 - 5) == (COMM_SUCCESS, 0)
+        silent = motors.build_read_stub(10, 1, 1, 4, reply=False)
+        assert handler.read1ByteTxRx(port, 1, 10)[1] == COMM_RX_TIMEOUT
+        port.closePort()
+    finally:
+        motors.close()
+    assert [motors.stubs[name].calls for name in (undefined, positions, written, silent)] == [1, 2, 1, 1]

@@ -141,6 +141,28 @@ def test_baud_can_be_changed(port: FakeSerial) -> None:
         port.baudrate = 0
 
 
+@pytest.mark.parametrize(
+    ("setting", "value", "answered"),
+    [
+        ("parity", serial.PARITY_EVEN, False),
+        ("parity", serial.PARITY_ODD, False),
+        ("parity", serial.PARITY_MARK, True),
+        ("bytesize", serial.SEVENBITS, False),
+        ("stopbits", serial.STOPBITS_TWO, True),
+    ],
+)
+def test_servos_understand_eight_bits_without_parity_only(
+    port: FakeSerial, setting: str, value: object, answered: bool
+) -> None:
+    usual = getattr(port, setting)
+    setattr(port, setting, value)
+    port.write(PING)
+    assert port.read(len(PONG)) == (PONG if answered else b"")
+    setattr(port, setting, usual)
+    port.write(PING)
+    assert port.read(len(PONG)) == PONG
+
+
 def test_closed_port(port: FakeSerial) -> None:
     port.close()
     port.close()

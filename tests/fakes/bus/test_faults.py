@@ -21,7 +21,7 @@ from hil.drivers.packet import (
 )
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
-from hil.fakes.bus.faults import FAULTS, Fault, FaultKind, parse_fault
+from hil.fakes.bus.faults import FAULTS, Fault, FaultKind, Faults, parse_fault
 from hil.fakes.description import DescriptionError, FakeArm, load_fake, make_bus
 from hil.fakes.plants.errors import PlantError
 from hil.fakes.plants.plant import CheckedPlant
@@ -320,6 +320,16 @@ def test_by_chance_or_not_at_all(bench: Any) -> None:
     bench.wait(1.0)
     assert bench.servo(1).hardware_error == 0
     assert bench.bus.faults.happened == []
+
+
+def test_a_long_run_remembers_the_latest_faults_and_the_number_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hil.fakes.bus.faults.MOST_REMEMBERED", 10)
+    faults = Faults(0, begin=lambda _: None, end=lambda _: None)
+    lost = Fault(kind="lost_reply")
+    for packet in range(25):
+        assert faults.strikes(lost, 1, float(packet))
+    assert faults.count == 25
+    assert [fault.time for fault in faults.happened] == [float(packet) for packet in range(10, 25)]
 
 
 def test_clear_ends_what_lasts(bench: Any) -> None:

@@ -223,6 +223,27 @@ def test_a_reversed_servo_on_a_reversed_joint_still_arrives() -> None:
     assert rig.shaft.position[0] < 0
 
 
+@pytest.mark.parametrize(
+    ("mode", "goal", "value"),
+    [(1, "Goal Velocity", 50), (3, "Goal Position", 3000), (16, "Goal PWM", 200)],
+    ids=["velocity", "position", "PWM"],
+)
+@pytest.mark.parametrize("drive_mode", [0, 1])
+def test_all_that_a_servo_measures_has_the_sign_of_its_goal(mode: int, goal: str, value: int, drive_mode: int) -> None:
+    rig = Rig(mode, Drive_Mode=drive_mode)
+    rig.write("Profile Velocity", 50)
+    rig.write("Torque Enable", 1)
+    before = rig.read("Present Position")
+    rig.write(goal, value)
+    rig.run(0.5)
+    assert (rig.shaft.velocity[0] < 0.0) == bool(drive_mode)
+    assert rig.read("Present Position") > before
+    assert rig.read("Present Velocity") > 5
+    assert rig.read("Present PWM") > 0
+    if mode != 16:
+        assert rig.read("Velocity Trajectory") == pytest.approx(rig.read("Present Velocity"), abs=5)
+
+
 def test_watchdog_stops_velocity_and_position_control() -> None:
     rig = Rig(1)
     rig.write("Bus Watchdog", 5)

@@ -165,17 +165,17 @@ def test_homing_offset_shifts_present_position(bench: Any) -> None:
     assert bench.read(1, 132, 4, signed=True) == -500
 
 
-@pytest.mark.parametrize(("model", "sign"), [("XM430-W350", 1), ("XL330-M288", 1), ("XM540-W270", -1)])
-def test_reverse_mode_turns_positions_and_by_series_all_else(make_bench: Make, model: str, sign: int) -> None:
+@pytest.mark.parametrize("model", ["XM430-W350", "XL330-M288", "XM540-W270"])
+def test_reverse_mode_turns_position_velocity_and_current(make_bench: Make, model: str) -> None:
     bench = make_bench({"model": load_model(model)})
     bench.plant.position[0] = 0.1
     before = bench.read(1, 132, 4, signed=True)
     assert bench.write(1, 10, 1) == 0
     assert bench.read(1, 132, 4, signed=True) == 4096 - before
     bench.plant.velocity[0] = 1.0
-    assert bench.read(1, 128, 4, signed=True) == sign * 42
+    assert bench.read(1, 128, 4, signed=True) == -42
     bench.arm(goal_ticks=100)
-    assert bench.servo().motor_current_a == pytest.approx(sign * 100 * load_model(model).current_unit_a)
+    assert bench.servo().motor_current_a == pytest.approx(-100 * load_model(model).current_unit_a)
 
 
 def test_a_goal_beyond_a_limit_that_was_lowered_later_is_limited(bench: Any) -> None:

@@ -10,7 +10,8 @@ from typing import cast
 import pytest
 
 import hil
-from benchmarks.bus.held_rate import six_servos
+from benchmarks.bus.held_rate import configured, six_servos
+from benchmarks.bus.socket_line import socket_line
 from hil.drivers.bus import ServoBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.setup import bus_rate
@@ -32,9 +33,27 @@ def test_six_servos_with_shadows_hold_400_hz_at_1_mbaud(tmp_path: Path) -> None:
     assert enough and possible >= 400
 
 
+def test_the_benchmarks_socket_leads_to_the_six_servos(tmp_path: Path) -> None:
+    path = six_servos(tmp_path)
+    with socket_line(path), ServoBus.open(configured(path, fast=True).bus) as bus:
+        assert len(bus.read_positions()) == 4 and len(bus.drives) == 6
+
+
 def test_a_slower_bus_does_not_and_says_so(tmp_path: Path) -> None:
     possible, enough = rate_of(six_servos(tmp_path, "115_200"))
     assert not enough and possible < 150
+
+
+@pytest.mark.parametrize(("delay_ms", "least"), [(8, 90), (16, 45), (60, 12)])
+def test_late_replies_of_a_slow_adapter_are_not_taken_for_the_next_ones(
+    arm_file: ArmFile, delay_ms: int, least: int
+) -> None:
+    slow = arm_file(("adapter_latency_us = 60.0", f"adapter_latency_us = {delay_ms}e3"))
+    findings = {each.what: each for each in hil.check(slow).findings}
+    assert [each for each in findings.values() if each.level == "stop"] == [findings["rate"]]
+    assert findings["adapter"].found == f"delays replies by {delay_ms}.0 ms, which limits the rate"
+    possible, _ = rate_of(slow)
+    assert least <= possible <= 1000 / delay_ms
 
 
 @pytest.mark.parametrize(("rate", "is_said"), [(400, False), (840, False), (880, True)])

@@ -234,7 +234,7 @@ def test_an_arm_that_needs_two_writes_is_found(arm: Arm, monkeypatch: pytest.Mon
 
 
 def test_a_cable_that_is_pulled_during_the_check_is_named(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
-    def lost(*_: object) -> int:
+    def lost(*_: object, **__: object) -> int:
         raise PortLost("The cable is out.")
 
     monkeypatch.setattr("hil.drivers.servo.Servo.ping", lost)
