@@ -123,7 +123,7 @@ class Guard:
         self._errors = [0] * len(config.joints)
         """Number of consecutive replies that contained both values and an error number, by joint."""
         self._was_irregular = False
-        """Whether replies were missing or reported an error in the previous exchange."""
+        """Whether, in the previous exchange, any reply was missing or reported an error."""
         self._resting: Sequence[float] | None = None
         self._held: HeldAtRest | None = None
         self._config = config
@@ -232,8 +232,9 @@ class Guard:
         self._stop(index, *TORQUE_LOST)
 
     def rests_at(self, positions: Sequence[float]) -> None:
-        """Store the angles that the joints had before torque was switched on [rad]; without this call, those of the
-        first sample are used. After it, `measure_noise` must be called with each exchange until `noise_is_known`.
+        """Store the angles that the joints had before torque was switched on [rad]; without this call, the angles in
+        the first sample are used. After this call, `measure_noise` must be called with each exchange until
+        `noise_is_known`.
         """
         self._resting = positions
         self._noise.begin()
@@ -285,7 +286,9 @@ class Guard:
             self._stop(index, Cause.EARLY_MOTION, said)
 
     def _else_moved(self, velocity: float) -> str:
-        """Return what, other than swinging, may have moved a joint before the start; velocity: its velocity [rad/s]."""
+        """Name possible causes, other than swinging, of a joint's motion before the start. velocity: its velocity
+        [rad/s].
+        """
         if abs(velocity) < self._safety.rest_velocity:
             return (
                 f"Otherwise, since it is not moving now ({velocity:+.2f} rad/s), check its encoder and magnet, and "
@@ -426,7 +429,9 @@ def _joint_records(config: Config, planned: Sequence[float], left_by_a_run: bool
 
 
 def _measures_supply(joint: JointConfig) -> bool:
-    """Whether the servo reports the supply current, not the motor current; then only motion and status are checked."""
+    """Whether the servo reports the supply current instead of the motor current; in that case, only motion and status
+    are checked.
+    """
     return joint.drive_mode is Mode.CURRENT and joint.joint.servo.senses_supply
 
 

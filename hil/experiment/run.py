@@ -44,7 +44,7 @@ from hil.setup.unmoved import Lies, has_stirred, refuse_moved, where_it_lies
 __all__ = ["run_experiment"]
 
 _LAST_SAMPLES = 100
-"""Number of samples attached to an exception."""
+"""Number of latest samples that are attached to an exception."""
 
 _FIRST_S = 3.0
 _DESCRIBED = (
@@ -148,7 +148,7 @@ def _play(
 ) -> str:
     """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event.
 
-    lay: where the servos were when the arm's pose was checked.
+    lay: positions of the servos when the arm's pose was checked.
 
     Returns sentences about settings that another program changed during the run, and about an arm that does not stay in
     its rest pose without torque; "" if neither happened.
@@ -199,7 +199,7 @@ def _play(
 
 
 def _moved_without_torque(config: Config, bus: ServoBus, recorder: Recorder) -> str:
-    """Say how the arm has moved since the last sample before torque was cut; "" if nothing is known."""
+    """Describe how the arm has moved since the last sample before torque was cut; "" if nothing is known."""
     samples = recorder.samples
     if not len(samples) or bus.torque_off_report is None:
         return ""
@@ -223,8 +223,8 @@ def _try_again(bus: ServoBus, note: Note) -> None:
 
 
 def _why_silent(bus: ServoBus, stop: SafetyStop) -> str:
-    """Say that replies were late if they arrived after torque was cut. Otherwise, if no servo was heard, say which ones
-    answered later: a silent servo hides the replies of those after it.
+    """Report late replies that arrived after torque was cut. Otherwise, if no servo was heard, name those that answered
+    later: a silent servo hides the replies of those after it.
     """
     report = bus.torque_off_report
     if stop.unheard is None or report is None:

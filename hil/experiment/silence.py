@@ -115,7 +115,9 @@ class Silence:
         return None
 
     def _delayed(self, seconds: float) -> str:
-        """Say that this computer caused `seconds` [s] of a silence; during lowering, only if it is known to be busy."""
+        """Tell how much of a silence of `seconds` [s] this computer caused; during lowering, only if it is known to be
+        busy.
+        """
         is_told = seconds >= LATE_WAKE_UP_S and (self.is_busy or not self._already)
         return f", {_ms(seconds)} of it because this computer was busy" if is_told else ""
 

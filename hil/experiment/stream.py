@@ -1,11 +1,11 @@
 """The real-time loop: one exchange, one guard check and one recorded sample per tick.
 
-If ticks are far apart, the same goals are exchanged again in between, without recording. Every check thus sees an
-exchange at least every `hil.drivers.bus.CHECK_S`, whatever the rate of the experiment.
+If ticks are far apart, the exchange is repeated in between with the same goals, without recording. Every check thus
+sees an exchange at least every `hil.drivers.bus.CHECK_S`, whatever the rate of the experiment.
 
 The sequence is: rest; for each multisine a ramp in, the warm-up (only before the first), periods until two successive
 ones match, the remaining periods to be recorded, and a ramp out; then no current until the arm is at rest. If the cause
-of a stop allows it, the arm is braked before `run` raises; the caller that switched torque on switches it off.
+of a stop allows it, the arm is braked before `run` raises; the caller, which switched torque on, then switches it off.
 """
 
 import math
@@ -44,8 +44,8 @@ from hil.setup.session.servo_session import has_moved
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
 _STILL_STEPS, _FALSE_STEPS = 1, 4
-"""Largest change in the reading of a joint at rest, in encoder steps: the joint may rest between two steps. The
-second value is the distance that reported velocities must add up to before they count as false.
+"""Largest change in the reading of a joint at rest, in encoder steps: the joint may rest between two steps. The second
+value is the distance, also in steps, to which reported velocities must add up before they count as false.
 """
 
 _BY_OTHER_GOALS = {
@@ -58,7 +58,7 @@ _BY_LOST_TORQUE = {
     *(Cause.NOT_FOLLOWING, Cause.FROZEN, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
-"""Causes of a stop that may be due to a servo without torque. Its Torque Enable is then read before torque is cut."""
+"""Causes of a stop that may be due to a servo without torque. Torque Enable is then read before torque is cut."""
 
 _BRAKING_WATCHDOG_S = 0.04
 """Timeout of the Bus Watchdog while the arm is braked [s]. It is shorter than during the experiment, which must allow
@@ -185,7 +185,7 @@ class Stream:
             try:
                 self._guard.torque_is_off(dead)
             except SafetyStop as lost:
-                symptom = re.split(r"[.:] ", str(error), maxsplit=1)[0].rstrip(".")  # without its other causes
+                symptom = re.split(r"[.:] ", str(error), maxsplit=1)[0].rstrip(".")  # without the other causes
                 lost.args = (f"{lost} Symptom: {symptom}.",)
                 lost.overruled = True
                 for note in getattr(error, "__notes__", ()):

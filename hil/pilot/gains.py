@@ -31,8 +31,8 @@ _TORQUE_SHARE = 0.35  # largest share of the torque limit at a deflection of 1 r
 
 
 def wandering(config: Config, belief: Belief) -> Mask:
-    """Joints that need a spring (joints,): all joints of an arm that falls over or lies flat, otherwise those held by
-    friction.
+    """Joints that need a spring (joints,): all joints if the arm falls over or lies flat, otherwise those that friction
+    holds.
     """
     arm = belief.middle
     stiffness = gravity_stiffness(config, arm)
@@ -66,7 +66,7 @@ def proposed(config: Config, belief: Belief, springs: Mask) -> StabiliserConfig:
     inertia = np.median([_inertia(config, each) for each in parameters], axis=0)
     friction, viscous = (np.median(_per_joint(config, parameters, name), axis=0) for name in ("coulomb", "viscous"))
     limit = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
-    # Two coupled joints on such springs oscillate more slowly than each alone; gravity is added.
+    # Two coupled joints on such springs oscillate more slowly than each would alone; gravity is added.
     spring = np.maximum(inertia * (2 * np.pi * _FREQUENCY) ** 2, _FRICTIONS_PER_RADIAN * friction)
     stiffness = _OUTWEIGHS * away + np.minimum(spring, _TORQUE_SHARE * limit)
     damping = np.maximum(2 * _DAMPING_RATIO * np.sqrt(stiffness * inertia) - viscous, 0.0)

@@ -61,8 +61,8 @@ class Search:
     fast: Mask = field(init=False)
     """Joints that exceeded their velocity limit in the last run before moving by MOVED_STEPS (joints,)."""
     calm: Array = field(init=False)
-    """Cap on the torque (joints,) [N m], below that of all runs in which a joint exceeded its velocity limit before
-    moving by MOVED_STEPS; infinite if there were none.
+    """Cap on the torque (joints,) [N m]: it is lower than in all runs in which a joint exceeded its velocity limit
+    before moving by MOVED_STEPS; infinite if there were no such runs.
     """
 
     def __post_init__(self) -> None:
@@ -153,7 +153,8 @@ class Search:
         return np.asarray(swing > MOVED_STEPS * step)
 
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
-        """The largest amplitude that is safe for all plausible arms. share: fraction of each limit that they may use.
+        """The largest amplitude that is safe for all plausible arms. share: fraction of each limit that the motion may
+        use.
 
         If there is no such amplitude, the amplitude of the last run is used, or a smaller one if the real arm has
         exceeded a limit. Raises NoSafeTorque if there is no such amplitude and there has been no run yet.
@@ -325,8 +326,8 @@ class Search:
         return np.asarray(np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0))
 
     def _refuse_velocity_limit(self, fast: Mask, held: Mask) -> NoReturn:
-        """Raise ExperimentError because of the velocity limit. fast: joints that exceeded it. held: joints that did not
-        move even at full torque.
+        """Raise ExperimentError because the velocity limit is too low. fast: joints that exceeded it. held: joints that
+        did not move even at full torque.
         """
         said = "; ".join(
             f"{joint.name}: velocity_limit = {joint.velocity_limit:g} rad/s, {MOVED_STEPS} encoder steps are "

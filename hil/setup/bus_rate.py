@@ -38,8 +38,9 @@ RATE_MARGIN = 1.2
 class ExchangeMode:
     """Measured timing of one exchange mode.
 
-    median_s, longest_s: round trips [s]. usual_s, slowest_s: 90 % quantile and median of the round trips with the
-    slowest kind of read [s]. lost: number of exchanges, out of CYCLES, with replies that were lost, not just late.
+    median_s, longest_s: median and maximum of the round trips [s]. slowest_s: median of the round trips with the
+    slowest kind of read [s]. usual_s: `slowest_s` plus the 90 % quantile of how much each round trip exceeds the median
+    for its kind of read [s]. lost: number of exchanges, out of CYCLES, with replies that were lost, not just late.
     """
 
     one_write: bool
@@ -92,7 +93,7 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
     """Measure every exchange mode, and check whether the configured one sustains `wanted` [Hz]; see `measure_modes`."""
     modes = measure_modes(bus)
     if _configured(bus, modes).rate < wanted:
-        # A busy computer delays exchanges for a while, a slow bus delays them always.
+        # A busy computer delays exchanges only for a while, a slow bus always.
         bus.port.clock.wait_until(bus.port.clock.now() + AGAIN_AFTER_S)
         modes = [_faster(*pair) for pair in zip(modes, measure_modes(bus), strict=True)]
     used = _configured(bus, modes)

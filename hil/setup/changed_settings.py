@@ -70,12 +70,13 @@ Settings = Mapping[tuple[Joint, str], int]
 
 
 def settings_now(bus: ServoBus, before: Settings | None = None) -> Settings:
-    """Read the settings that determine how servos move, what they report and when they protect themselves.
+    """Read the settings that determine how servos move, what they report and when they shut down.
 
     Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
-    to an earlier request. If the two readings differ, the value is unknown and omitted, as are all values of a
-    servo whose ID is read wrongly: its replies are late, so even equal values may be those of other registers. Values
-    that differ from `before` are confirmed once more, since another program would be blamed for the change.
+    to an earlier request. If the two readings differ, the value is unknown and omitted. If a servo's ID register does
+    not read as its ID, all its values are omitted: its replies are late, so even equal values may be those of other
+    registers. Values that differ from `before` are confirmed once more, since another program would be blamed for the
+    change.
     """
     found: dict[tuple[Joint, str], int] = {}
     report = bus.torque_off_report
@@ -130,7 +131,9 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
 
 
 def _swapped(before: Settings, after: Settings) -> tuple[Joint, Joint] | None:
-    """Return a servo that now has all the settings that another had, and that other servo; None if there is no pair."""
+    """Return a servo that now has all the settings that another servo had, and that other servo; None if there is no
+    such pair.
+    """
     old, new = _by_joint(before), _by_joint(after)
     for first, second in permutations(old, 2):
         if old[first] != old[second] == new.get(first):

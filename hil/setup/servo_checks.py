@@ -25,7 +25,7 @@ _LONG_RETURN_DELAY_US = 20
 def check_servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> Iterator[Finding]:
     """Check one servo; stop early if it does not answer or is of another model.
 
-    Nothing is written, except to restore settings that an earlier program changed and did not restore.
+    Nothing is written except settings that an earlier program changed and did not restore.
     """
     where = str(joint)
     try:

@@ -55,7 +55,9 @@ _FASTER = 1.3
 
 
 def may_lower(config: Config, error: BaseException) -> bool:
-    """Whether to lower the arm before torque is cut after this error: configuration and cause must both allow it."""
+    """Whether, after this error, the arm is to be lowered before torque is cut: configuration and cause must both allow
+    it.
+    """
     if not config.is_chain or config.safety.stop == "cut":
         return False
     if not isinstance(error, ExperimentError):
@@ -108,7 +110,7 @@ class Lowering:
         return bool(np.abs(self._away(state)).max() < LYING_RAD)
 
     def lies_elsewhere(self, state: State) -> str:
-        """Say which joints are not in the rest pose, and where they are instead."""
+        """Name the joints that are not in the rest pose, with their positions."""
         each = zip(self._config.joints, state.position, self._away(state), strict=True)
         found = [
             f"{joint.name!r} is at {position:.3f} rad, {away:+.2f} rad from it"
@@ -213,7 +215,7 @@ class Lowering:
             self._look_at_obedience(index, state)
 
     def _look_at_distance(self, joint: int, away: float) -> None:
-        """Check a joint that is `away` [rad] from its path; if it was pushed, ask for a new path."""
+        """Check a joint that is `away` [rad] from its path; if it was pushed, request a new path."""
         pushed = self._obedience.is_pushed(joint)
         self.needs_another_path = pushed and self._paths < MOST_PATHS
         if not self.needs_another_path:
