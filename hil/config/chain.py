@@ -28,7 +28,7 @@ DEFAULT_BAND = (0.1, 1.5)
 
 _MOST_TURNED_RAD = 4.5 * math.pi
 _SAME_GRAVITY = 0.1  # m/s^2
-_HARMONICS = 2  # minimum for a path
+_HARMONICS = 2  # minimum number of harmonics for a path
 _PLANAR = 2
 _WIDER_RAD = 1e-3
 _OPTIONS = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")

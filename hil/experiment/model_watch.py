@@ -173,9 +173,8 @@ _TIMES = np.dtype(
 seen_at, seconds: time of the latest sample, and time since the previous one [s]; seconds is infinite if the motion in
 between is not judged. shortest: duration of the shortest exchange [s]. vague: the time of a measurement counts as known
 if its exchange took at most this much longer than `shortest` [s]. longest_gap: largest `seconds` over which changes of
-velocity are judged [s].
-follows: fraction of a torque step that the motor has reached by the next sample. least: smallest change of velocity
-that counts as a jolt [rad/s]. jolts_s: longest duration of a jolt [s].
+velocity are judged [s]. follows: fraction of a torque step that the motor has reached by the next sample. least:
+smallest change of velocity that counts as a jolt [rad/s]. jolts_s: longest duration of a jolt [s].
 """
 
 _DRIVE = np.dtype([(name, "f8") for name in ("constant", "goal", "felt")])

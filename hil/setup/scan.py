@@ -23,8 +23,8 @@ _PATIENCE_S = _SLOT_S * (MAX_ID + 1)
 _STATUS_BYTES = 14
 
 _DIFFERENT = ("Present Position", "Realtime Tick")
-"""Registers that never have the same value on two servos. If two servos have the same ID, equal replies merge into one,
-but different ones corrupt each other.
+"""Registers that hardly ever have the same value on two servos. If two servos have the same ID, equal replies merge
+into one, but different ones corrupt each other.
 """
 
 
