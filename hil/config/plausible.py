@@ -1,4 +1,4 @@
-"""Detection of unit errors (such as degrees for radians, mm for m, mA for A) with which a file is valid but dangerous.
+"""Detection of unit errors (such as degrees for radians, mm for m, mA for A) that make a valid file dangerous.
 
 Every physical quantity is compared with what a servo of that model could move. The margin is so wide that external
 gears, light plastic links and heavy test rigs pass, but wrong units do not.

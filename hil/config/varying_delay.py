@@ -1,4 +1,4 @@
-"""Detection of sample rates at which the delay with which a voltage-driven servo applies its goals varies slowly.
+"""Detection of sample rates at which a voltage-driven servo applies its goals with a slowly varying delay.
 
 Such a servo applies a goal when its control loop runs next. If the sample interval is almost a whole number of the
 loop's periods, the delay rises slowly by one period, falls back, and rises again: a slow beat, to which the arm

@@ -101,7 +101,7 @@ class Guard:
         self.clamp = commands.clamp
         """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""
         self.holding = commands.holding
-        """Set the goals now in effect [A or V], from which `clamp` continues."""
+        """Store the goals now in effect [A or V]; `clamp` limits the next change relative to these."""
         planned = planned or _planned(config)
         interval = 1.0 / rate if interval is None else interval
         self.recent = RecentMotion(config, interval) if recent is None else recent

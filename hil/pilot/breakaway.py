@@ -37,7 +37,8 @@ unexplained.
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
-    """Return `torque` (joints,) [N m], but `ratio` times the `former` torque for joints that stood `still`.
+    """Return the next torques (joints,) [N m]: `torque`, except that joints that stood `still` get `ratio` times the
+    `former` one.
 
     most: upper limit for those joints, set by the current limits (joints,) [N m].
     """

@@ -279,8 +279,8 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """Return `found`. If it leaves much of the position range unused, try other waves too, and return the amplitude
-        whose motion covers the largest part of the range.
+        """Return `found` or, if it leaves much of the position range unused, the amplitude with other waves whose
+        motion covers more of the range.
         """
         options = self.options
         limited = (found.peak_torque >= options.at_limit * most_torque(config)).all() or self.cap is not None

@@ -102,7 +102,9 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
 
 
 def seldom_as_measured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> str:
-    """Return `seldom_read_back` for the configured exchange mode with its measured timing. Raises DriverError."""
+    """Call `seldom_read_back` with the measured timing of the configured exchange mode, and return its warning. Raises
+    DriverError.
+    """
     used = _configured(bus, modes)
     exchange = bus.make_exchange(fast=used.fast, one_write=used.one_write)
     bus.add_read_back(exchange)
@@ -135,7 +137,7 @@ def _faster(first: ExchangeMode, second: ExchangeMode) -> ExchangeMode:
 def measure_modes(bus: ServoBus) -> list[ExchangeMode]:
     """Measure every exchange mode on servos whose torque is off, without changing their goals. Raises DriverError.
 
-    Every tenth exchange includes the slow reads, so that their duration counts.
+    Every tenth exchange includes the slow reads, so that their duration is taken into account.
     """
     goals = [servo.read(drive.mode.goal_register) for drive, servo in bus.drives.items()]
     reads = (True, False) if bus.knows_fast_sync_read() else (False,)

@@ -87,7 +87,7 @@ latest three values span `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
-"""Velocity below which its reading may stay the same while a joint sticks and slips, and resolution of this reading
+"""Velocity below which the reading may stay the same while a joint sticks and slips, and resolution of the reading
 [rad/s].
 """
 

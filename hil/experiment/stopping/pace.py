@@ -39,7 +39,7 @@ class Pace:
     def patience(self, unheard: float, *, are_late: bool) -> float:
         """How long the next exchange may wait for replies [s].
 
-        unheard: time since the latest reply of all servos [s]. are_late: whether recent replies were too late.
+        unheard: time since all servos last replied [s]. are_late: whether recent replies were too late.
         """
         if not are_late and not self._was_late:
             return self._usual

@@ -21,7 +21,7 @@ NOISE_RAD, NOISE_TIMES = 0.01, 3.0
 """Smallest assumed error [rad], and the assumed error as a multiple of the RMS residual."""
 
 CERTAINLY = 2.0
-"""Multiple of the errors above which a difference is a fault."""
+"""A difference is a fault if it exceeds this multiple of the errors."""
 
 FIELDS = (("least", "f8"), ("most", "f8"))
 """The range of the bias [rad/s]."""

@@ -49,7 +49,7 @@ REBOOT_S = 0.6
 """A servo that does not answer at the end may be booting; it is tried again after this time [s]."""
 
 COUNT_DOWN_S = 5.0
-"""After a stopped run, time [s] between the warning that the arm will move again and torque being switched on."""
+"""Time from the warning that the arm will move again, after a stopped run, until torque is switched on [s]."""
 
 
 def to_stderr(text: str) -> None:

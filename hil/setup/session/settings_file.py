@@ -102,7 +102,7 @@ def keep(
 ) -> Kept:
     """Write the file of a servo; it is on disk when this function returns. Raises RunFolderError.
 
-    A file of the same servo under another name of the port is removed afterwards.
+    If a file of the same servo exists under another name of the port, it is removed afterwards.
 
     since: when these settings were first saved; by default, now. config: absolute path of the configuration.
     """
