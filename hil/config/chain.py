@@ -46,7 +46,7 @@ def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
 
 
 def doubted_limits(config: "Config") -> Iterator[str]:
-    """Yield one sentence per joint whose limits in the description are invalid or do not contain its path.
+    """Yield one sentence for each joint whose limits in the description are invalid or do not contain the joint's path.
 
     position_limit is allowed to exceed the described limits at either end by the margin that a path leaves free.
     """

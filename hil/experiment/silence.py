@@ -115,8 +115,8 @@ class Silence:
         return None
 
     def _delayed(self, seconds: float) -> str:
-        """Tell how much of a silence of `seconds` [s] this computer caused; during lowering, only if it is known to be
-        busy.
+        """Attribute `seconds` [s] of a silence to this computer; "" if that is short or, during lowering, if the
+        computer is not known to be busy.
         """
         is_told = seconds >= LATE_WAKE_UP_S and (self.is_busy or not self._already)
         return f", {_ms(seconds)} of it because this computer was busy" if is_told else ""

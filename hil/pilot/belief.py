@@ -24,7 +24,7 @@ from hil.plan.stabiliser import feedback_of
 from hil.results.result import Result
 
 _FRICTION = ("viscous", "coulomb", "stribeck_rise")
-_FRICTION_CHANGE = 0.1  # relative standard deviation of friction from one day to another
+_FRICTION_CHANGE = 0.1  # relative standard deviation of friction from day to day
 
 _LINEAR = ("offset", "zero")
 """Parameters that may have either sign, and are therefore not represented by their logarithms."""

@@ -25,7 +25,7 @@ _FREQUENCY = 0.7  # Hz, natural frequency of each joint on its own spring
 _DAMPING_RATIO = 0.35
 _OUTWEIGHS = 1.3  # relative to the largest destabilising gravity stiffness of all arms
 _FRICTIONS_PER_RADIAN = 1.5
-_HELD = 1.5  # friction over gravity's torque at one radian from rest: at 1 it holds the joint at any angle
+_HELD = 1.5  # ratio of friction to gravity's torque one radian from rest; at 1, friction holds the joint at any angle
 _DRIVEN = 0.8  # largest share of a joint's damping that the delay of its spring may cancel
 _TORQUE_SHARE = 0.35  # largest share of the torque limit at a deflection of 1 rad, beyond what gravity needs
 

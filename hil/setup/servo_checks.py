@@ -118,7 +118,7 @@ def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: S
     torque = servo.read("Torque Enable")
     fix = "Another program is driving it: stop that program first, or power-cycle the servo."
     if torque and servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
-        fix = "A program that has ended left it on, and the servo's watchdog has tripped. Power-cycle the servo."
+        fix = "A program left it on when it ended, and the servo's watchdog has tripped. Power-cycle the servo."
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
 
 

@@ -12,8 +12,8 @@ from hil.drivers.joint import Joint
 from hil.drivers.servo_model import Mode
 
 ALLOWED_RAD = 0.1
-"""Allowed change of the difference between the angles of two servos [rad]: allows for backlash in both gear trains,
-encoder nonlinearity, and twist of the joint between the servos.
+"""Largest accepted change of the difference between the angles of two servos [rad]. It allows for backlash in both gear
+trains, encoder nonlinearity, and twist of the joint between the servos.
 """
 
 

@@ -66,7 +66,7 @@ STDS = 2.0
 """Number of standard deviations by which the estimates of lag and scale error may be wrong."""
 
 BIAS_LAG_S, BIAS_SCALE, BIAS_LAG_SHARE = 0.002, 0.005, 0.1
-"""For the check for creep: errors that are added to the standard deviations of lag and scale error [s, 1], and the
+"""Used when checking for creep: errors added to the standard deviations of lag and scale error [s, 1], and the
 allowance for a lag that is not a pure delay, as a fraction of the lag times the range of velocities.
 """
 
