@@ -26,7 +26,7 @@ def axis_of(arm: ArmDescription, angles: Array, joint: int) -> tuple[Array, Arra
 
 
 def moves(arm: ArmDescription, angles: Array, joint: int, up: Array | tuple[float, float, float] = UPRIGHT) -> str:
-    """Say in words in which direction an increasing angle of a joint moves or turns the arm's end.
+    """Describe in words the direction in which an increasing angle of a joint moves or turns the arm's end.
 
     up: the direction opposite to gravity in the base's frame (3,).
     """

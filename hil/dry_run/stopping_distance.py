@@ -74,7 +74,7 @@ class Stopping:
 
 @dataclass(frozen=True)
 class _Start:
-    """Initial state of a stop.
+    """State in which stopping begins.
 
     state: as expected by `respond` (5 or 6, joints). goal: torque commanded by the previous goals (joints,) [N m].
     jammed: index of a blocked joint, or None.

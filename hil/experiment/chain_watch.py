@@ -4,8 +4,8 @@ The prior knowledge is the ensemble's mean and inflated covariance. While the ar
 support it, so no joint is judged. A joint that stands still at its rest angle may be lying against an end stop, so it
 is judged only while torque pushes it back towards the side from which it came. The same applies to a joint that has
 just returned to that angle, since it may have hit the end stop. A joint that has not yet left its rest angle may be
-lying against an end stop on the side towards which gravity pulls it: it is judged only while its torque acts towards
-that side.
+lying against an end stop on the side towards which gravity pulls it. If such a joint fails to move towards that side,
+this is accepted, unless the commanded torque pushes it there as well.
 """
 
 import math

@@ -134,7 +134,7 @@ class Guard:
         self._silence.woke_up(now, late)
 
     def others_answer(self) -> None:
-        """Record that some servos that seem silent do reply, but that a silent servo hides their replies."""
+        """Record that some servos seem silent only because a silent servo hides their replies."""
         self._silence.others_answer = True
 
     def late(self, seconds: float = 0.0) -> None:
@@ -183,7 +183,7 @@ class Guard:
         return self._status.is_in_doubt
 
     def _look_one_by_one(self, state: State, unsure: float) -> None:
-        """Check an exchange with missing replies or with errors in replies, or one that follows such an exchange."""
+        """Check an exchange in which replies are missing or report errors, or the exchange that follows it."""
         now, missing, error = state.time_before_write, state.missing, state.error
         self._silence.ask(now)
         # While the arm is being lowered, waiting for replies may take up much of the allowed time.

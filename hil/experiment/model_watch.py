@@ -81,14 +81,14 @@ changes.
 """
 
 IMPACT_TIMES, IMPACT_S = 1.5, 10.0
-"""Smallest ratio of a jolt to the largest earlier change of velocity that was not followed by a change back, and
-the time constant with which that earlier change is forgotten [s].
+"""Smallest ratio of a jolt to the largest earlier change of velocity that was not reversed soon afterwards, and the
+time constant with which that earlier change is forgotten [s].
 """
 
 PLAY_RAD, CURVED = 0.03, 0.2
-"""Displacement that a gear may cause within a jolt [rad], a few times the backlash in a servo's data sheet, because an
-elastic gear bounces from one flank to the other; and allowance for the curvature of ordinary motion, as a fraction of
-the usual change of velocity times the duration.
+"""The first value is the displacement that a gear may cause within a jolt [rad]: a few times the backlash in a servo's
+data sheet, because an elastic gear bounces from one flank to the other. The second one allows for the curvature of
+ordinary motion, as a fraction of the usual change of velocity times the duration.
 """
 
 _USUAL_S = 1.0

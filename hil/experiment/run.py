@@ -51,7 +51,8 @@ _DESCRIBED = (
     "Since the motion had just begun, check first whether the configuration fits the arm: each joint's "
     "direction, id, torque_constant and wiring."
 )
-"""Advice for a stop within `_FIRST_S` [s] of the first goal, unless an earlier run of this session moved the arm."""
+"""Advice if the arm is stopped within `_FIRST_S` [s] of the first goal, unless an earlier run of this session moved it.
+"""
 
 _MOST_UNSEEN = 20
 """Number of progress reports that may be queued for the observer (about one second)."""
@@ -271,8 +272,8 @@ def _check_unchanged(bus: ServoBus) -> Settings:
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, modes_seen_ago: float) -> None:
     """Name settings that another program changed. They are read only once torque is off, because reading takes time.
 
-    Changes that can explain a stop are named before its message. Others, including any that may have followed the stop,
-    are named after it.
+    Changes that can explain why the run was stopped are named before the error's message. Others, including any that
+    may have been made later, are named after it.
     """
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return

@@ -54,7 +54,7 @@ class Silence:
         self.any_missed = False
         """Whether any joint has missed the latest reply."""
         self.others_answer = False
-        """Whether some servos that seem silent are known to reply: a silent servo hides their replies."""
+        """Whether some servos are known to seem silent only because a silent servo hides their replies."""
 
     @property
     def is_busy(self) -> bool:

@@ -52,13 +52,13 @@ _BY_OTHER_GOALS = {
     *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
-"""Causes of a stop that may be due to goals sent by another program."""
+"""Reasons for stopping that may be due to goals sent by another program."""
 
 _BY_LOST_TORQUE = {
     *(Cause.NOT_FOLLOWING, Cause.FROZEN, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
-"""Causes of a stop that may be due to a servo without torque. Torque Enable is then read before torque is cut."""
+"""Reasons for stopping that may be due to a servo without torque. Torque Enable is then read before torque is cut."""
 
 _BRAKING_WATCHDOG_S = 0.04
 """Timeout of the Bus Watchdog while the arm is braked [s]. It is shorter than during the experiment, which must allow
@@ -144,7 +144,7 @@ class Stream:
         self._repetition = Repetition(longest, len(bus.joints), self._pace.interval)
 
         self.modes_seen_ago = float("inf")
-        """Time from the latest correct read-back of the operating modes to a stop by the guard [s]."""
+        """Time from the latest correct read-back of the operating modes until the guard stopped the stream [s]."""
 
     def begins_at(self, positions: Sequence[float]) -> None:
         """Store the joints' last angles before torque is switched on [rad]; the first sample must agree with them."""

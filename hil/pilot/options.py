@@ -73,8 +73,7 @@ class PilotOptions:
     falling_share: float = 0.85
     """Fraction of the limits that runs may use on an arm that falls over when it is stopped."""
     min_falling_torque: float = 0.05
-    """Torque that is always allowed for an arm that falls over, as a fraction of the torque that the current limit
-    allows.
+    """Torque always allowed for an arm that falls over when it is stopped, relative to the torque at the current limit.
     """
     start_inside: float = 0.95
     """An arm that a stopped run left beyond its position limits is assumed to start within this fraction of its range,

@@ -1,4 +1,4 @@
-"""Braking: if possible, a stop begins with currents that oppose the joints' velocities.
+"""Braking, the first stage of stopping an arm where possible: currents oppose the joints' velocities.
 
 Braking is limited in time and stays within the current limits. It ends at once when a reply or deadline is
 missed, a servo raises an alert, a second signal arrives, or a joint speeds up, as it does if its motor turns the wrong

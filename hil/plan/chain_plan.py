@@ -96,7 +96,7 @@ def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str,
 
 
 def lowering_samples(config: Config) -> int:
-    """Maximum number of samples in a stop that lowers the arm, including braking and coming to rest."""
+    """Maximum number of samples for lowering a stopped arm, including braking and coming to rest."""
     safety = config.safety
     return round((safety.lower_time + 1.0 + 2.0 * SETTLE_IN) * config.experiment.rate)
 

@@ -1,4 +1,5 @@
-"""Path along which a stop lowers a spatial arm: from any pose to the rest pose, clear of obstacles and in bounded time.
+"""Path along which a stopped spatial arm is lowered: from any pose to the rest pose, clear of obstacles, in bounded
+time.
 
 The path is straight in joint space if a straight path is clear. Otherwise it leads straight to the first reachable pose
 of the planned transition from the rest pose, and then back along that transition, which is known to be clear.

@@ -29,7 +29,7 @@ PATIENCE_S = 0.05
 AGAIN_AFTER_S = 0.5
 """If the configured rate seems too high for the bus, the bus is measured again after this time [s]."""
 SHARE = 0.9
-"""Fraction of a period that the exchange may take; the rest is left for the computer."""
+"""Fraction of a period that the exchange may take; the remainder is left for the computer."""
 RATE_MARGIN = 1.2
 """Minimum ratio of the measured rate to the rate chosen from it, so that a later measurement confirms the choice."""
 

@@ -263,7 +263,7 @@ class Lowering:
         )
 
     def others_answer(self) -> None:
-        """Record that some servos that seem silent do reply, but that a silent servo hides their replies."""
+        """Record that some servos seem silent only because a silent servo hides their replies."""
         self._guard.others_answer()
 
     def late(self, seconds: float) -> None:
