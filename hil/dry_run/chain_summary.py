@@ -65,7 +65,7 @@ class ChainDryRun:
 
 
 def unsafe(config: Config, foreseen: ChainPrediction) -> str:
-    """Explain why a motion is not safe; empty if it is."""
+    """Explain why a motion is not safe; "" if it is."""
     peaks = foreseen.peaks
     if not foreseen.is_clear:
         return f"too little clearance, {foreseen}"

@@ -4,8 +4,8 @@ so much friction that gravity cannot move a joint.
 The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction within a radian,
 and soft enough to leave most of the torque for the excitation.
 
-At a low sample rate, the delay of such a spring would drive the joint (`hil.plan.stabiliser`). The damper is then made
-stronger and the spring softer, as far as rate and gravity allow.
+At a low sample rate, such a spring would act so late that the joint would oscillate (`hil.plan.stabiliser`). The damper
+is then made stronger and the spring softer, as far as rate and gravity allow.
 """
 
 from math import ceil

@@ -33,7 +33,7 @@ from hil.plan.recent_motion import RecentMotion
 from hil.plan.way_home import PULL_PER_S, PULL_SHARE, WayHome
 
 LEAVES_RAD = 0.35
-"""Largest accepted tracking error [rad]: a joint with a larger one does not follow its path to the rest pose."""
+"""Largest accepted tracking error [rad]: if it is larger, the joint is not following its path to the rest pose."""
 
 MOST_PATHS = 4
 """Maximum number of paths to the rest pose: if the arm is pushed off the last one, lowering is abandoned."""

@@ -1,7 +1,7 @@
 """A session with the arm's servos: their settings are saved before the first write and restored after the last.
 
 A session holds the port. A session inside another one for the same arm shares the port, so that the steps of a pilot
-write each EEPROM register only once. Each register is also restored only once, when the outermost block is left for
+write each EEPROM register only once. Each register is also restored only once, when the outermost block ends, for
 whatever reason. If a killed program left saved settings behind, these are taken as the servos' original settings and
 restored at the end (`killed_run`).
 """
