@@ -17,7 +17,7 @@ BASE = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 """Frame of the base: rotation matrix row by row, then origin."""
 
 FLOOR, BOXES = -1, -2
-"""Second member of a pair: the index of another capsule, FLOOR, or `BOXES - index` for a box."""
+"""Second member of a pair, if it is not the index of another capsule: FLOOR, or `BOXES - index` for a box."""
 
 _SEARCHES = 40
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)

@@ -1,4 +1,4 @@
-"""Vertices of an STL (binary or text) or OBJ mesh file, for its bounding box."""
+"""Reads the vertices of an STL (binary or text) or OBJ mesh file, from which its bounding box follows."""
 
 from pathlib import Path
 

@@ -2,7 +2,8 @@
 positions.
 
 A capsule is the set of points within its radius of a line segment. A mesh is replaced by its bounding box. A link whose
-geometry cannot be read gets a capsule from joint to joint with a guessed radius, and is listed in `Shapes.guessed`.
+geometry cannot be read is assumed to be a capsule of guessed radius from joint to joint, and is listed in
+`Shapes.guessed`.
 """
 
 import xml.etree.ElementTree as ET
@@ -47,7 +48,7 @@ class Shapes:
     """The capsules of an arm.
 
     names: names of the links, the base's first. guessed: links whose shape was guessed from the joint positions.
-    doubts: for each guessed link, except a base without geometry, one sentence that says why the shape is unknown and
+    doubts: one sentence for each guessed link, except a base without geometry; it explains why the shape is unknown and
     what replaces it.
     """
 
@@ -160,7 +161,9 @@ def _of_geom(geom: Geom) -> list[tuple[Array, float]]:
 
 
 def _pieces(capsule: Capsule) -> list[Capsule]:
-    """Split a capsule, because the piece next to a joint is allowed to touch a link that the rest must not touch."""
+    """Split a capsule, because the piece next to a joint is allowed to touch a link that the other pieces must not
+    touch.
+    """
     length = float(np.linalg.norm(capsule.ends[1] - capsule.ends[0]))
     if not length < np.inf:
         return [capsule]  # rejected by `shapes_of`
@@ -170,7 +173,7 @@ def _pieces(capsule: Capsule) -> list[Capsule]:
 
 
 def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Capsule], list[str]]:
-    """Capsules around everything fixed to one moving link, and, if shapes could not be read, the reasons."""
+    """Return capsules around everything fixed to one moving link, and why any shapes could not be read."""
     found, unread = [], []
     for _, rotation, translation, element in here:
         if element is None:
@@ -189,7 +192,9 @@ def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Ca
 
 
 def _placed(arm: ArmDescription) -> list[Placed]:
-    """For each link of a URDF: element, frame, and the moving link to which it is fixed. Empty for other formats."""
+    """Return, for each link of a URDF, its frame, its element, and the moving link to which it is fixed; nothing for
+    other formats.
+    """
     if b"<robot" not in arm.path.read_bytes():
         return []
     root = parse_urdf(arm.path)

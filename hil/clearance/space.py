@@ -1,4 +1,4 @@
-"""A spatial arm and what it must not touch: itself, the floor and the boxes of `[clearance]`."""
+"""A spatial arm and what it must not touch: itself, the floor, and the boxes given in `[clearance]`."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -34,8 +34,8 @@ TOUCHED = 0.02
 
 RANDOM_POSES = 400
 AT_REST_SLACK = 0.008
-"""If a pair is closer than the margin in the rest pose, it is allowed to come closer still, by up to this distance
-[m], on the way to or from that pose.
+"""If a pair is closer than the margin in the rest pose, it may come even closer, by up to this distance [m], on the way
+to or from that pose.
 """
 
 AT_REST_INSIDE = 0.02

@@ -28,7 +28,7 @@ DEFAULT_BAND = (0.1, 1.5)
 
 _MOST_TURNED_RAD = 4.5 * math.pi
 _SAME_GRAVITY = 0.1  # m/s^2
-_HARMONICS = 2  # minimum for a path
+_HARMONICS = 2  # minimum number of harmonics for a path
 _PLANAR = 2
 _WIDER_RAD = 1e-3
 _OPTIONS = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
@@ -46,7 +46,7 @@ def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
 
 
 def doubted_limits(config: "Config") -> Iterator[str]:
-    """Yield one sentence per joint whose limits in the description are invalid or do not contain its path.
+    """Yield one sentence for each joint whose limits in the description are invalid or do not contain the joint's path.
 
     position_limit is allowed to exceed the described limits at either end by the margin that a path leaves free.
     """

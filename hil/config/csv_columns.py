@@ -35,7 +35,7 @@ PWM_UNITS = {"1": 1.0, "%": 1e-2}
 
 
 class Columns(Table):
-    """`[columns]`: the meaning and unit of each column. Anything omitted is taken from the column headers."""
+    """`[columns]`: the meaning and unit of each column. Whatever is omitted is taken from the column headers."""
 
     time: Column | None = None
     rate: PositiveFloat | None = Field(None, le=1e5, description="samples per second, if there is no time column")
@@ -106,7 +106,9 @@ class Columns(Table):
         return None if self.torque_constant is None or self.drive != "current" else list(self.torque_constant)
 
     def without_effect(self, *, in_ticks: bool) -> tuple[str, ...]:
-        """Return the given keys that have no effect with these columns. in_ticks: whether positions are in ticks."""
+        """Return those keys of the table that have no effect with these columns. in_ticks: whether positions are in
+        ticks.
+        """
         by_voltage = self.drive in {"voltage", "pwm"}
         applies = {
             "time_unit": self.time is not None,

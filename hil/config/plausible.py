@@ -1,4 +1,4 @@
-"""Detection of unit errors (such as degrees for radians, mm for m, mA for A) that leave a file valid but dangerous.
+"""Detection of unit errors (such as degrees for radians, mm for m, mA for A) that make a valid file dangerous.
 
 Every physical quantity is compared with what a servo of that model could move. The margin is so wide that external
 gears, light plastic links and heavy test rigs pass, but wrong units do not.
@@ -182,6 +182,8 @@ def _too_much(key: str, value: float, most: float, unit: str, joint: "JointConfi
 
 
 def _meant(value: float, unit: str, most: float, least: float = 0.0) -> str:
-    """Return ". If it is in mm, write 0.147" for the unit in which the value is plausible; "" if there is none."""
+    """Return text such as ". If it is in mm, write 0.147" for the unit in which the value is plausible; "" if there is
+    none.
+    """
     hint = in_other_units(value, unit, lambda converted: least <= abs(converted) <= most)
     return f". {hint}" if hint else ""

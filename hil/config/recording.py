@@ -1,4 +1,4 @@
-"""Description of an arm whose recording was made elsewhere: the recording's columns, and some properties of the arm.
+"""Description of an arm that was recorded with other tools: the recording's columns, and some properties of the arm.
 
 The TOML file of an experiment can be used, or a shorter one. Tables and keys that only an experiment needs are
 ignored; unknown ones are errors.
@@ -48,7 +48,7 @@ class ArmFacts(Table):
 
 
 class RecordingConfig(Table):
-    """The tables of an arm's TOML file that apply to a recording made elsewhere; all of them are optional."""
+    """The tables of an arm's TOML file that apply to a recording made with other tools; all of them are optional."""
 
     columns: Columns = Columns()
     arm: ArmFacts = ArmFacts()
@@ -95,7 +95,7 @@ def parse_recording_config(text: str, path: Path) -> RecordingConfig:
 
 
 def _relevant(values: dict[str, Any]) -> dict[str, Any]:
-    """The values without the tables and keys that only an experiment needs; unknown tables and keys remain."""
+    """The values without the tables and keys that only an experiment needs; unknown ones remain."""
     kept = _without(values, RecordingConfig, Config)
     if isinstance(kept.get("arm"), dict):
         kept["arm"] = _without(kept["arm"], ArmFacts, ArmConfig)

@@ -1,7 +1,7 @@
 """The TOML file that describes the arm, its limits and its experiment; this module reads and checks it.
 
-`load_config` returns a frozen `Config` or raises ConfigError, which names the file, the key, the value and what is
-allowed.
+`load_config` returns a frozen `Config` or raises ConfigError; its message gives the file, the key, the value and the
+allowed values.
 """
 
 import math
@@ -430,8 +430,8 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
 def port_url(port: str) -> str:
     """The URL of a port.
 
-    `port` can be a URL or a device, which is returned unchanged; a TOML file; the name of a fake arm for other programs
-    (`koch`); or, if no such arm exists, the name of a bundled configuration. Raises ConfigError.
+    `port` can be a URL or a device, which is returned unchanged; a TOML file; the name of a fake arm that other
+    programs use (`koch`); or, if no such arm exists, the name of a bundled configuration. Raises ConfigError.
     """
     url = _url_of(port)
     fakes.register_for(url)

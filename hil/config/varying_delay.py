@@ -1,4 +1,4 @@
-"""Detection of a sample rate at which the delay of a voltage-driven servo's goals varies slowly.
+"""Detection of sample rates at which a voltage-driven servo applies its goals with a slowly varying delay.
 
 Such a servo applies a goal when its control loop runs next. If the sample interval is almost a whole number of the
 loop's periods, the delay rises slowly by one period, falls back, and rises again: a slow beat, to which the arm
@@ -17,7 +17,7 @@ _LOOP_HZ = 1000
 """Assumed rate of the servos' control loop [Hz], which ROBOTIS does not publish; the fake servos use the same rate."""
 
 _FASTEST = 4.0
-"""Only a beat slower than this many times the highest excited frequency is noticeable."""
+"""A beat is noticeable only if its frequency is below this multiple of the highest excited frequency."""
 
 _CHOICES = (20, 25, 40, 50, 100, 125, 200, 250, 500, 1000)
 """Sample rates without a beat [Hz]."""

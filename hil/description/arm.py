@@ -30,7 +30,7 @@ class Body:
         return cls(0.0, np.zeros(3), np.zeros((3, 3)))
 
     def moved(self, rotation: Array, translation: Array) -> "Body":
-        """Express the body in another frame; rotation (3, 3) and translation (3,) [m] give the pose of its present
+        """Express the body in another frame; rotation (3, 3) and translation (3,) [m] give the pose of the present
         frame in the new one.
         """
         return Body(self.mass, rotation @ self.centre + translation, rotation @ self.inertia @ rotation.T)
@@ -113,7 +113,7 @@ class ArmDescription:
     held: tuple[str, ...]
     """Movable joints outside the arm, such as a gripper's, which are assumed to be held at zero."""
     doubts: tuple[str, ...]
-    """Warnings about implausible inertias and physics that is not modelled, one sentence each."""
+    """Warnings about implausible inertias and about effects that are not modelled, one sentence each."""
     gravity: tuple[float, float, float] | None = None
     """Gravity in the base's frame as given in the file [m/s^2]; None if it is not given or is the format's default."""
 

@@ -1,4 +1,4 @@
-"""The copy of an arm's file that a run folder keeps; it must be readable without the files next to the original."""
+"""The copy of an arm's file in a run folder; it must be readable without the files next to the original."""
 
 from pathlib import Path
 

@@ -135,7 +135,7 @@ class _Tree:
         return None if (x, y, z) == USUAL_GRAVITY else (x, y, z)
 
     def not_modelled(self, names: list[str], bodies: list[int]) -> Iterator[str]:
-        """Yield one sentence per kind of force in the file that the model (rigid links with friction) does not
+        """Yield one sentence for each kind of force in the file that the model (rigid links with friction) does not
         include.
         """
         model = self.model
@@ -236,8 +236,8 @@ class _Tree:
     def on_link(
         self, body: int, rotation: Array, translation: Array, number: dict[int, int]
     ) -> tuple[int, Array, Array]:
-        """The number of the moving link to which a body is fixed, and a pose converted from the body's frame to that
-        link's frame.
+        """Return the number of the moving link to which a body is fixed, and a pose converted from the body's frame to
+        that link's frame.
         """
         while body != WORLD and body not in number:
             turn, place = self._placed(body)

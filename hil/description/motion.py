@@ -1,4 +1,6 @@
-"""The pose of a described arm, and how each joint moves it, in terms that a person can compare with the real arm."""
+"""The pose of an arm given by its description, and how each joint moves it, in terms that a person can compare with the
+real arm.
+"""
 
 import numpy as np
 
@@ -24,7 +26,7 @@ def axis_of(arm: ArmDescription, angles: Array, joint: int) -> tuple[Array, Arra
 
 
 def moves(arm: ArmDescription, angles: Array, joint: int, up: Array | tuple[float, float, float] = UPRIGHT) -> str:
-    """Describe in words in which direction a positive angle of a joint moves or turns the arm's end.
+    """Describe in words the direction in which an increasing angle of a joint moves or turns the arm's end.
 
     up: the direction opposite to gravity in the base's frame (3,).
     """

@@ -1,4 +1,5 @@
-"""URDF files: the branch formed by the arm's joints, with everything rigidly attached merged into its links.
+"""Reads from a URDF the branch formed by the arm's joints, with everything that is rigidly attached merged into its
+links.
 
 Format: wiki.ros.org/urdf/XML. Only geometry and inertias are read; meshes are not opened.
 """
@@ -247,7 +248,7 @@ def _all_turning(tree: dict[str, _Joint], base: str, path: Path) -> list[str]:
 
 
 def _turns(joint: _Joint, tree: dict[str, _Joint]) -> bool:
-    """Whether this joint or any joint beyond it rotates."""
+    """Whether this joint or any joint farther from the base rotates."""
     if joint.kind in TURNING:
         return True
     return any(_turns(other, tree) for other in tree.values() if other.parent == joint.child and other.mimics is None)

@@ -1,4 +1,4 @@
-"""Use dry runs to find the largest torque per joint that keeps the risk of exceeding a limit acceptably low."""
+"""Find, by dry runs, the largest torque of each joint at which the risk of exceeding a limit is acceptably low."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -51,13 +51,13 @@ class AmplitudeOptions:
     this number.
     """
     back_off: float = 0.93
-    """Factor applied to the torque when the check on all arms has failed."""
+    """Factor by which the torque is multiplied when the check on all arms has failed."""
     torque_share: float = 0.97
     """Fraction of the current limit that may be used, since clamping would distort the designed wave."""
     initial_share: float = 0.125
     """Initial torque, relative to the torque that the current limits allow."""
     initial_safe_share: float = 0.25
-    """Torque assumed to be safe until the search finds a larger safe one, relative to the initial torque."""
+    """Torque, relative to the initial one, that is assumed to be safe until the search finds a larger safe torque."""
 
 
 DEFAULTS = AmplitudeOptions()
@@ -109,7 +109,7 @@ def largest_amplitude(
     worst: NDArray[np.intp] = np.arange(0)
     for _ in range(options.max_rounds):
         plan = scaled(config, base, found)
-        # The arms that were worst at a higher torque are the cheapest test of whether this torque is too high, too.
+        # The cheapest test of whether this torque is also too high uses the arms that were worst at a higher one.
         if not _too_many(config, plan, ensemble.only(worst), share, pose, ensemble.size):
             prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
             if _chance(prediction, share) <= config.safety.limit_chance:
@@ -124,7 +124,7 @@ def largest_amplitude(
 def _no_torque(
     config: Config, plan: Plan, ensemble: Ensemble, share: float, pose: Array | None, executor: Executor | None
 ) -> str:
-    """Name the joint and limit that the largest number of arms exceed at the smallest torque that was tried."""
+    """Report the limit that the largest number of arms exceed at the smallest torque that was tried."""
     prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
     exceeding = (prediction.shares[:, :GUARDED] >= share).sum(axis=0)
     quantity, at = np.unravel_index(int(np.argmax(exceeding)), exceeding.shape)

@@ -1,7 +1,7 @@
 """Check whether an unpowered arm has too little energy to exceed its position limits.
 
 An unpowered arm cannot reach a pose with more potential energy than its total energy. If every pose on the boundary of
-the permitted range has more than that, the arm's swing need not be simulated.
+the permitted range has more potential energy than that, the arm's swing need not be simulated.
 """
 
 from dataclasses import dataclass

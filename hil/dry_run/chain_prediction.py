@@ -31,10 +31,10 @@ RAN_AWAY = 1e3
 class ChainPrediction:
     """Prediction of a spatial arm's experiment.
 
-    peaks: predicted peaks and their limits. nearest: smallest clearance among all arms, which occurs `moment` [s] into
-    the segment `role`. rooms: smallest clearance of each arm minus the required one (arms,) [m]. tracking: median of
-    the arms' largest tracking errors (joints,) [rad]. ways: number of samples of the transition at either end of the
-    first segment.
+    peaks: predicted peaks and their limits. nearest: smallest clearance of any arm, which occurs `moment` [s] after the
+    beginning of the segment `role`. rooms: smallest clearance of each arm minus the required one (arms,) [m]. tracking:
+    median of the arms' largest tracking errors (joints,) [rad]. ways: number of samples of the transition at either end
+    of the first segment.
     """
 
     peaks: Prediction
@@ -66,7 +66,7 @@ def predict_chain(
     """Simulate `plan` on every arm. Raises ArmFileError, ConfigError.
 
     tell: called with the number of simulations done and the total. shown: number of motions to store. passed: whether
-    each joint has ever been below and above its rest pose (2, joints), as for `resting_stops`.
+    each joint has ever been below its rest pose (row 0) and above it (row 1), as for `resting_stops`.
     """
     space = Space.of(config)
     limits, rest = limits_of(config), np.array(config.arm.rest_pose)

@@ -22,7 +22,7 @@ INERTIA_SPREAD = 0.3
 OFFSET_PER_COULOMB = 0.1
 GEAR_EFFICIENCY, GENERATED_SPREAD = 0.6, 0.25
 COULOMB_WIDTH = 0.05  # rad/s
-LEAST_INERTIA = 0.2  # smallest factor on a link's central inertia, so that no draw makes it a point mass
+LEAST_INERTIA = 0.2  # smallest factor for a link's inertia about its centre, so that no draw makes it a point mass
 
 
 def prior_arms(config: Config, known: KnownChain, count: int, seed: int = 0) -> ChainArms:
@@ -41,7 +41,7 @@ def prior_arms(config: Config, known: KnownChain, count: int, seed: int = 0) -> 
     drive[:, 4] = _log_normal(random, np.ones(n), torque_constant_stds(config), count)
     drive[:, 5] = _log_normal(random, *friction["lag"], count)
     rotors = _log_normal(random, *friction["armature"], count)
-    # The back-EMF of voltage-driven joints also lags, which makes these joints behave as if they were lighter.
+    # The back-EMF of voltage-driven joints lags too, so these joints behave as if they were lighter.
     lost = friction["generated"][0] * drive[:, 0] * drive[:, 5]
     rotors = rotors - np.minimum(lost, MOST_LOST * rotors)
     every = np.concatenate((links, rotors[:, :, None]), axis=2).reshape(count, -1)

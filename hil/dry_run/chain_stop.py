@@ -1,7 +1,7 @@
 """Simulation of stopping a spatial arm: it is lowered if its servos still accept commands, and falls if they do not.
 
-Stops begin at times spread over the planned path. For each, the path home and the unpowered fall up to the first
-collision are simulated.
+Stops begin at times spread over the planned path. For each of them, the path to the rest pose and the unpowered fall up
+to the first collision are simulated.
 """
 
 from collections.abc import Callable
@@ -31,9 +31,9 @@ LAID_DOWN = 0.95
 class Fall:
     """The worst of the simulated falls.
 
-    moment: time in the path at which it starts [s]. hits: names of the colliding parts; None if nothing collides within
-    FALL_S. seconds: duration [s]. height: largest descent [m]. speed: largest speed at the end of the fall [m/s].
-    beyond: largest overshoot of each joint beyond its limits in any fall (joints,) [rad].
+    moment: time along the path at which it starts [s]. hits: names of the colliding parts; None if nothing collides
+    within FALL_S. seconds: duration [s]. height: largest descent [m]. speed: largest speed at the end of the fall
+    [m/s]. beyond: largest distance by which each joint exceeds its limits in any fall (joints,) [rad].
     """
 
     moment: float
@@ -49,7 +49,7 @@ class LoweringForeseen:
     """Prediction of how the arm is lowered when it is stopped.
 
     seconds: longest duration [s]. nearest: smallest clearance. lies: fraction of simulations that end in the rest pose.
-    joint: name of the joint that ends farthest from its rest angle, by `away` [rad]. helps: a remedy.
+    joint: name of the joint that ends farthest from its rest angle, by `away` [rad]. helps: suggested remedy.
     """
 
     seconds: float
@@ -95,8 +95,8 @@ def foreseen_stops(
 ) -> ChainStops:
     """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError.
 
-    tell: called with the number of simulations done and the total. passed: whether each joint has ever been below and
-    above its rest pose (2, joints), as for `resting_stops`.
+    tell: called with the number of simulations done and the total. passed: whether each joint has ever been below its
+    rest pose (row 0) and above it (row 1), as for `resting_stops`.
     """
     segment = plan.segments[0]
     assert isinstance(segment, PathSegment)

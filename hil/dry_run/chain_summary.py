@@ -56,7 +56,7 @@ class ChainDryRun:
         return not self.why_not(config)
 
     def why_not(self, config: Config) -> str:
-        """Explain why the motion, or a stop during it, is not safe; "" if both are safe."""
+        """Explain why the motion, or stopping during it, is not safe; "" if both are safe."""
         return self.doubt(config) if self.refused is None else self.refused
 
     def doubt(self, config: Config) -> str:
@@ -65,7 +65,7 @@ class ChainDryRun:
 
 
 def unsafe(config: Config, foreseen: ChainPrediction) -> str:
-    """Explain why a motion is not safe; empty if it is."""
+    """Explain why a motion is not safe; "" if it is."""
     peaks = foreseen.peaks
     if not foreseen.is_clear:
         return f"too little clearance, {foreseen}"

@@ -1,4 +1,4 @@
-"""Parameter sets that the real arm may have, drawn from a prior or from an earlier result with its covariance."""
+"""Plausible parameter sets of the real arm, drawn from a prior, or from an earlier result and its covariance."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,7 +109,9 @@ def result_draws(result: Result, count: int) -> list[dict[str, float]]:
 
 
 def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: int) -> Array:
-    """Draw (count, parameters) from a normal distribution, scaling parameters that differ by orders of magnitude."""
+    """Draw (count, parameters) from a normal distribution. Parameters are scaled, since they differ by orders of
+    magnitude.
+    """
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     correlation = covariance / np.outer(scale, scale)
     size, axes = np.linalg.eigh(0.5 * (correlation + correlation.T))

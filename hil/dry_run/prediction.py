@@ -34,7 +34,7 @@ follow from the other quantities.
 
 QUANTILE = 0.99
 _ARMS_A_TASK = 16
-"""Number of arms that one task of an executor simulates."""
+"""Number of arms simulated by one task of an executor."""
 _LEAST_SPREAD = 2e-3
 
 
@@ -82,8 +82,8 @@ class Prediction:
         return self._value_at(np.where(usual >= 1.0, usual, self.shares_with(chance)))
 
     def shares_with(self, chance: float) -> Array:
-        """Fractions of the limits (quantities, joints) that are exceeded with a total probability of `chance`, or the
-        worst arm's if they are larger.
+        """Fractions of the limits (quantities, joints) that are exceeded with a total probability of `chance`, or those
+        of the worst arm where these are larger.
         """
         foreseen = self.share_at(NormalDist().inv_cdf(1 - chance / (2 * GUARDED)))
         return np.asarray(np.maximum(foreseen, self.shares.max(axis=0)))
@@ -93,7 +93,9 @@ class Prediction:
 
     @property
     def stop_chance(self) -> float:
-        """Probability that the guard stops the run: the fraction of arms it stops, or the tail estimate if larger."""
+        """Probability that the guard stops the run: the fraction of arms that it stops or, if larger, the tail
+        estimate.
+        """
         counted = float(np.mean((self.shares[:, :GUARDED] >= 1).any(axis=(1, 2))))
         return max(counted, min(1.0, float(self.limit_chance[:GUARDED].sum())))
 
@@ -229,7 +231,7 @@ def peaks_of(config: Config, position: Array, velocity: Array, current: Array) -
 
 
 def scaled_feedback(feedback: Feedback, scale: Array) -> Feedback:
-    """The effective feedback on an arm whose torque constants are `scale` (joints,) times the assumed ones."""
+    """The effective feedback for an arm whose torque constants are `scale` (joints,) times the assumed ones."""
     return Feedback(feedback.stiffness * scale, feedback.damping * scale, feedback.pose, feedback.limit * scale)
 
 

@@ -17,9 +17,9 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.terms import term_of
 
 _LINK_MASS_PER_LENGTH = 1.1  # kg/m, for XM430 servos with printed or aluminium brackets
-_USUAL_STALL = 4.1  # N m, stall torque of those servos; smaller servos carry lighter links
+_USUAL_STALL = 4.1  # N m, stall torque of those servos; weaker servos carry lighter links
 _STALL_POWER = 0.4
-_CENTRE_SHARE = 0.6  # fraction of the length; a gripper or weight moves the centre outwards
+_CENTRE_SHARE = 0.6  # fraction of the length; a gripper or weight shifts the centre of mass outwards
 _CENTRE_SPREAD = 0.3
 _INERTIA_SHARE = 1 / 12  # fraction of mass times length squared, as for a rod
 _ROUGH_SPREAD = 0.5

@@ -23,7 +23,8 @@ NEAR_STOP_RAD = 0.14
 
 
 PASSED_RAD = 0.05
-"""A joint that has been this far [rad] beyond its rest pose has no end stop there: no end stop yields that much."""
+"""A joint that has moved this far [rad] beyond its rest pose has no end stop there, since no end stop yields that much.
+"""
 
 
 def resting_stops(config: Config, arms: ChainArms, planned: Sequence[Array] = (), passed: Mask | None = None) -> Array:
@@ -32,8 +33,8 @@ def resting_stops(config: Config, arms: ChainArms, planned: Sequence[Array] = ()
     A joint is assumed to rest against an end stop if its rest pose is near the end of its range, nothing else touches
     the part of the arm that it moves, and gravity does not pull it away from the stop. This is not assumed if a
     recording or a planned path takes the joint beyond its rest pose, within its configured limits. planned: positions
-    of the planned paths, each (joints, samples) [rad]. passed: whether each joint has been below and above its rest
-    pose, as returned by `passed_rest` (2, joints). Raises ArmFileError.
+    of the planned paths, each (joints, samples) [rad]. passed: whether each joint has been below its rest pose (row 0)
+    and above it (row 1), as returned by `passed_rest`. Raises ArmFileError.
     """
     rest = np.array(config.arm.rest_pose)
     low, high = _ends(config, rest)

@@ -70,7 +70,7 @@ def simulate_experiment(
 
 
 class _Arm:
-    """The simulated arm during the experiment; `parts` holds its motion so far."""
+    """State of the simulated experiment on one arm; `parts` holds its motion so far."""
 
     def __init__(self, plan: Plan, physics: Physics, scale: Array, feedback: Feedback, pose: Array) -> None:
         self._plan, self._physics, self._scale, self._feedback = plan, physics, scale[:, None], feedback

@@ -74,7 +74,7 @@ class Stopping:
 
 @dataclass(frozen=True)
 class _Start:
-    """Initial state of a stop.
+    """State in which stopping begins.
 
     state: as expected by `respond` (5 or 6, joints). goal: torque commanded by the previous goals (joints,) [N m].
     jammed: index of a blocked joint, or None.
@@ -93,8 +93,8 @@ _Commands = Callable[[_Start], Iterator[list[_Piece]]]
 
 
 def stopping_distance(config: Config, plan: Plan, ensemble: Ensemble, velocity: Array) -> Stopping:
-    """Simulate both kinds of stop on a few arms of the ensemble; limits are crossed at up to `velocity` (joints,)
-    [rad/s].
+    """Simulate stops of both kinds, planned and passed, on a few arms of the ensemble; limits are crossed at up to
+    `velocity` (joints,) [rad/s].
     """
     return Stopping(beyond_when_planned(config, plan, ensemble), beyond_when_passed(config, plan, ensemble, velocity))
 
@@ -159,7 +159,9 @@ def _planned_goals(config: Config, plan: Plan) -> Array:
 
 
 def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array) -> list[_Start]:
-    """States of the planned motion before it reaches a limit: some evenly spaced, others likely to overshoot most."""
+    """States of the planned motion before it reaches a limit: some are evenly spaced, and others are likely to
+    overshoot most.
+    """
     rest = resting(np.array(config.arm.rest_pose))
     moved = respond(physics, rest, goals * scale[:, None], config.experiment.rate, _felt(config, scale), COARSE)
     until = _within_limits(config, moved)
@@ -302,7 +304,9 @@ class _Stops:
         yield [(start.goal, self._none, _REACTION), (pushed, self._none, NOTICED_AFTER), self._off]
 
     def silent(self, start: _Start) -> Iterator[list[_Piece]]:
-        """All servos keep their goals until their watchdogs trip; or only one does, and the others are cut earlier."""
+        """Either all servos keep their goals until their watchdogs trip, or only one does and the others are cut
+        earlier.
+        """
         kept = (start.goal, self._none, self._heard_for)
         yield [kept, self._off]
         for silent in range(start.goal.size if start.goal.size > 1 else 0):

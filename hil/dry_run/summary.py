@@ -235,7 +235,7 @@ def _list(values: Array, digits: int = 2) -> str:
 
 
 def _percent(chance: float) -> str:
-    """Format a probability as a percentage; "below 0.01 %" in the far tail, which a few hundred arms cannot resolve."""
+    """Format a probability as a percentage; "below 0.01 %" if it is too small to estimate from these arms."""
     if chance < 1e-8:
         return "0 %"
     return "below 0.01 %" if chance < 1e-4 else percent(chance)

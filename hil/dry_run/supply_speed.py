@@ -1,4 +1,4 @@
-"""Speed limit set by the supply: near no-load speed, its voltage cannot drive the commanded current.
+"""Speed limit set by the supply: near no-load speed, the supply voltage cannot drive the commanded current.
 
 If the currents fall short of their goals, no parameters can be identified from the run. In PWM mode the back-EMF is
 part of the model, and no such limit is needed.

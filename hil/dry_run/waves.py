@@ -1,5 +1,5 @@
-"""Choice of the waves for a full run: multisines with a low crest factor that make good use of the position range, or
-optimally designed ones.
+"""Choice of the waves for a full run: either multisines with a low crest factor that make good use of the position
+range, or optimally designed multisines.
 """
 
 from dataclasses import replace
@@ -46,7 +46,9 @@ def _variants(config: Config, problem: DesignProblem, segment: Segment) -> list[
 
 
 def _evenness(problem: DesignProblem, wave: Multisine) -> float:
-    """Range covered by the motion, relative to the largest one within the limits, for the worse joint; 1 is ideal."""
+    """Range covered by the motion, as a fraction of the largest range within the limits, for the worse joint; 1 is
+    ideal.
+    """
     ones = np.ones((1, wave.joints))
     arms = ManyArms([problem.physics], ones, problem.pose[None], problem.feedback)
     position = arms.positions(np.tile(wave.torque, 2), wave.rate, _EVERY)[0]

@@ -4,8 +4,8 @@ The prior knowledge is the ensemble's mean and inflated covariance. While the ar
 support it, so no joint is judged. A joint that stands still at its rest angle may be lying against an end stop, so it
 is judged only while torque pushes it back towards the side from which it came. The same applies to a joint that has
 just returned to that angle, since it may have hit the end stop. A joint that has not yet left its rest angle may be
-lying against an end stop on the side towards which gravity pulls it: it is judged only while its torque acts towards
-that side.
+lying against an end stop on the side towards which gravity pulls it. If such a joint fails to move towards that side,
+this is accepted, unless the commanded torque pushes it there as well.
 """
 
 import math
@@ -29,7 +29,9 @@ from hil.plan.obedience import Residual
 
 ARMS = 96
 WIDENED = 1.5
-"""Factor applied to the ensemble's standard deviations, for effects that its model does not include."""
+"""Factor by which the ensemble's standard deviations are enlarged, to allow for effects that its model does not
+include.
+"""
 
 LYING_RAD = 0.08
 _FRICTIONS = 8.0
@@ -39,8 +41,8 @@ friction of up to twice the mean from raising an alarm.
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
 _IMPACT_S, _MOST_REBOUND = 0.05, 0.5
-"""How long a joint that has returned to its rest angle may bounce off an end stop [s], and its largest speed while it
-bounces, relative to its speed before the impact.
+"""How long a joint that has returned to its rest angle may bounce off an end stop [s], and its largest speed while
+bouncing, as a fraction of its speed before the impact.
 """
 WINDOW_S = 0.3
 """Time span [s] for which a message about a stationary joint gives the range of torques."""
@@ -84,7 +86,9 @@ class ChainWatch:
         self._velocity = np.zeros(n)
         """Latest velocities (joints,) [rad/s]."""
         self._hit_at, self._hit_speed = np.full(n, -np.inf), np.zeros(n)
-        """When each joint may last have hit an end stop near its rest angle [s], and its speed before that [rad/s]."""
+        """Time at which each joint may last have hit an end stop near its rest angle [s], and its speed before that
+        impact [rad/s].
+        """
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
@@ -120,7 +124,7 @@ class ChainWatch:
     def _support(self, is_away: Mask, velocity: Array, torque: Array) -> Array:
         """Direction in which an end stop may block each joint (joints,): 1, -1, or 0 if none can.
 
-        is_away: whether each joint is away from its rest angle. torque: commanded (joints,) [N m].
+        is_away: whether each joint is away from its rest angle. torque: commanded torque (joints,) [N m].
         """
         may_lie = ~self._was_below & ~self._was_above & (torque * self._falls_to <= self._friction)
         towards = np.where(may_lie, self._falls_to, self._was_below * 1.0 - self._was_above * 1.0)

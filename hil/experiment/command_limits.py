@@ -33,7 +33,7 @@ class CommandLimits:
         return clamped
 
     def holding(self, goals: Sequence[float]) -> None:
-        """Set the goals now in effect [A or V], from which `clamp` continues."""
+        """Store the goals now in effect [A or V]; `clamp` limits the next change relative to these."""
         self._former = list(goals)
 
     def _limited(self, goal: float, former: float, limit: float, name: str) -> float:

@@ -101,7 +101,7 @@ class Guard:
         self.clamp = commands.clamp
         """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""
         self.holding = commands.holding
-        """Set the goals now in effect [A or V], from which `clamp` continues."""
+        """Store the goals now in effect [A or V]; `clamp` limits the next change relative to these."""
         planned = planned or _planned(config)
         interval = 1.0 / rate if interval is None else interval
         self.recent = RecentMotion(config, interval) if recent is None else recent
@@ -123,7 +123,7 @@ class Guard:
         self._errors = [0] * len(config.joints)
         """Number of consecutive replies that contained both values and an error number, by joint."""
         self._was_irregular = False
-        """Whether replies were missing or reported an error in the previous exchange."""
+        """Whether, in the previous exchange, any reply was missing or reported an error."""
         self._resting: Sequence[float] | None = None
         self._held: HeldAtRest | None = None
         self._config = config
@@ -134,7 +134,7 @@ class Guard:
         self._silence.woke_up(now, late)
 
     def others_answer(self) -> None:
-        """Record that some servos that seem silent do reply, but that a silent servo hides their replies."""
+        """Record that some servos seem silent only because a silent servo hides their replies."""
         self._silence.others_answer = True
 
     def late(self, seconds: float = 0.0) -> None:
@@ -183,7 +183,7 @@ class Guard:
         return self._status.is_in_doubt
 
     def _look_one_by_one(self, state: State, unsure: float) -> None:
-        """Check an exchange with missing replies or with errors in replies, or one that follows such an exchange."""
+        """Check an exchange in which replies are missing or report errors, or the exchange that follows it."""
         now, missing, error = state.time_before_write, state.missing, state.error
         self._silence.ask(now)
         # While the arm is being lowered, waiting for replies may take up much of the allowed time.
@@ -232,8 +232,9 @@ class Guard:
         self._stop(index, *TORQUE_LOST)
 
     def rests_at(self, positions: Sequence[float]) -> None:
-        """Store the angles that the joints had before torque was switched on [rad]; without this call, those of the
-        first sample are used. After it, `measure_noise` must be called with each exchange until `noise_is_known`.
+        """Store the angles that the joints had before torque was switched on [rad]; without this call, the angles in
+        the first sample are used. After this call, `measure_noise` must be called with each exchange until
+        `noise_is_known`.
         """
         self._resting = positions
         self._noise.begin()
@@ -285,7 +286,9 @@ class Guard:
             self._stop(index, Cause.EARLY_MOTION, said)
 
     def _else_moved(self, velocity: float) -> str:
-        """Return what, other than swinging, may have moved a joint before the start; velocity: its velocity [rad/s]."""
+        """Name possible causes, other than swinging, of a joint's motion before the start. velocity: its velocity
+        [rad/s].
+        """
         if abs(velocity) < self._safety.rest_velocity:
             return (
                 f"Otherwise, since it is not moving now ({velocity:+.2f} rad/s), check its encoder and magnet, and "
@@ -426,7 +429,9 @@ def _joint_records(config: Config, planned: Sequence[float], left_by_a_run: bool
 
 
 def _measures_supply(joint: JointConfig) -> bool:
-    """Whether the servo reports the supply current, not the motor current; then only motion and status are checked."""
+    """Whether the servo reports the supply current instead of the motor current; in that case, only motion and status
+    are checked.
+    """
     return joint.drive_mode is Mode.CURRENT and joint.joint.servo.senses_supply
 
 

@@ -31,7 +31,9 @@ UNLIKE_ANY_ARM = "does not move like any arm"
 
 ARMS = 64
 WIDENED = 1.5
-"""Factor applied to the ensemble's standard deviations, for effects that its model does not include."""
+"""Factor by which the ensemble's standard deviations are enlarged, to allow for effects that its model does not
+include.
+"""
 
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
@@ -69,8 +71,8 @@ _LAG_S = 0.012
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 JOLT_S, JOLT_BACK_S = 0.01, 0.08
-"""Times within which a slipping joint's velocity changes, and changes back [s]; at rates below about 40 Hz, the latter
-is three sample intervals.
+"""Time within which a slipping joint's velocity changes, and time within which it changes back [s]; below about 40 Hz,
+the latter is three sample intervals.
 """
 
 JOLT_RAD_S, JOLT_TIMES = 1.2, 5.0
@@ -79,14 +81,14 @@ changes.
 """
 
 IMPACT_TIMES, IMPACT_S = 1.5, 10.0
-"""Smallest ratio of a jolt to the largest earlier change of velocity that was not followed by a change back, and
-the time constant with which that earlier change is forgotten [s].
+"""Smallest ratio of a jolt to the largest earlier change of velocity that was not reversed soon afterwards, and the
+time constant with which that earlier change is forgotten [s].
 """
 
 PLAY_RAD, CURVED = 0.03, 0.2
-"""Displacement that a gear may cause within a jolt [rad], a few times the backlash in a servo's data sheet, because an
-elastic gear bounces from one flank to the other; and allowance for the curvature of ordinary motion, as a fraction of
-the usual change of velocity times the duration.
+"""The first value is the displacement that a gear may cause within a jolt [rad]: a few times the backlash in a servo's
+data sheet, because an elastic gear bounces from one flank to the other. The second one allows for the curvature of
+ordinary motion, as a fraction of the usual change of velocity times the duration.
 """
 
 _USUAL_S = 1.0
@@ -100,7 +102,7 @@ JOLT = np.dtype(
     [(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun", "impact")]
     + [("count", "i8"), ("oldest", "i8"), ("reversed", "i8")]
 )
-"""Statistics of a joint's changes of velocity; initially zero, except `begun`, which is minus infinity.
+"""Statistics of the changes of a joint's velocity; all are initially zero, except `begun`, which is minus infinity.
 
 square: mean square of ordinary changes [rad^2/s^2], over age [s]. squared, since: integral of the squared changes that
 are not yet included because they may belong to a jolt, and the time that it covers [s]. change: first change of a
@@ -149,7 +151,7 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
         if is_jolt and not is_open:
             joint.impact = max(joint.impact, abs(joint.change) * math.exp((joint.begun - now) / IMPACT_S))
             joint.begun, joint.change, joint.reversed, is_open = now, change, turned_round, True
-        # A possible beginning of a jolt only counts as ordinary motion once it has turned out not to be one.
+        # What may be the beginning of a jolt counts as ordinary motion only once no jolt has followed.
         joint.squared += seconds * min(change * change, most * most)
         joint.since += seconds
         if not is_open:
@@ -171,13 +173,13 @@ _TIMES = np.dtype(
 seen_at, seconds: time of the latest sample, and time since the previous one [s]; seconds is infinite if the motion in
 between is not judged. shortest: duration of the shortest exchange [s]. vague: the time of a measurement counts as known
 if its exchange took at most this much longer than `shortest` [s]. longest_gap: largest `seconds` over which changes of
-velocity are judged [s]. follows: fraction of a torque step that the motor has followed by the next sample. least:
+velocity are judged [s]. follows: fraction of a torque step that the motor has reached by the next sample. least:
 smallest change of velocity that counts as a jolt [rad/s]. jolts_s: longest duration of a jolt [s].
 """
 
 _DRIVE = np.dtype([(name, "f8") for name in ("constant", "goal", "felt")])
-"""A joint's torque: the constant [N m/A or N m/V], the latest goal [A or V] (NaN before the first one), and the
-torque that the motor has reached [N m].
+"""A joint's torque per goal [N m/A or N m/V], its latest goal [A or V] (NaN before the first one), and the torque that
+its motor has reached [N m].
 """
 
 
@@ -370,7 +372,7 @@ class ModelWatch:
 
 
 def standing_for(states: Iterable[State], joint: int) -> float:
-    """Return how long a joint has hardly moved [s], judging by its angle.
+    """Return for how long a joint's angle has hardly changed [s].
 
     states: the latest states, the most recent first.
     """
@@ -383,7 +385,7 @@ def standing_for(states: Iterable[State], joint: int) -> float:
 
 
 def not_moving(name: str, torques: Sequence[float], seconds: float) -> str:
-    """Say that a joint stood still for `seconds` [s] under `torques` [N m], which should have moved it."""
+    """Report that a joint stood still for `seconds` [s] under `torques` [N m], which should have moved it."""
     low, high = min(torques), max(torques)
     return (
         f"{name} is not moving, with {low:+.3f} to {high:+.3f} N m commanded in the last {seconds:.2g} s: any arm "

@@ -9,7 +9,7 @@ from hil.drivers.state import State
 from hil.experiment.guard import Guard
 
 _FORGETS = 0.98
-"""Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
+"""Factor by which the stored longest duration of an exchange decays with each exchange."""
 
 
 def read_back(bus: ServoBus, guard: Guard, due: float) -> None:
@@ -68,7 +68,7 @@ class Pace:
         return state
 
     def between(self, goal: Sequence[float]) -> Iterator[State]:
-        """Exchange the same goals until the next sample is due; yield each state.
+        """Repeat the exchange with the same goals until the next sample is due; yield each state.
 
         An exchange that might delay the next sample is skipped: the adapter may be slow, or a servo silent.
         """

@@ -27,8 +27,8 @@ FLOOR_RAD = 0.05
 
 LASTING_S = 0.03
 UNJUDGED_S, _MOST_UNJUDGED = 0.2, 0.25
-"""Time at the end of a period that does not affect the tolerance in the next one [s], and its upper bound, as a
-fraction of the period.
+"""Duration of the part at the end of a period that does not affect the tolerance in the next one [s], and its upper
+bound, as a fraction of the period.
 """
 
 _FEWEST = 2  # samples, however low the rate
@@ -51,7 +51,8 @@ _SUMS = np.dtype(
 lowest, highest: range of its positions [rad]. first: first position in the second half of the period. sum,
 sum_of_squares, seen: sum, sum of squares and number of the positions in that half, relative to `first` to avoid
 cancellation. squared, pairs: sum of squares and number of their changes from the previous period. early_squared,
-early_pairs: the same for the first half. sure_squared, sure_pairs: the same for the second half without its end.
+early_pairs: `squared` and `pairs` for the first half. sure_squared, sure_pairs: the same for the second half without
+its end.
 """
 
 
@@ -147,7 +148,7 @@ def _add_loop(
     sure: bool,
     anew: bool,
 ) -> int:
-    """Add one sample; return the joint that has differed from the previous period for longest."""
+    """Add one sample; return the joint that has differed from the previous period for the longest time."""
     longest = 0
     for joint in range(len(position)):
         sums, latest, before = all_sums[joint], position[joint], former[joint, index]

@@ -44,14 +44,15 @@ from hil.setup.unmoved import Lies, has_stirred, refuse_moved, where_it_lies
 __all__ = ["run_experiment"]
 
 _LAST_SAMPLES = 100
-"""Number of samples attached to an exception."""
+"""Number of latest samples that are attached to an exception."""
 
 _FIRST_S = 3.0
 _DESCRIBED = (
     "Since the motion had just begun, check first whether the configuration fits the arm: each joint's "
     "direction, id, torque_constant and wiring."
 )
-"""Advice for a stop within `_FIRST_S` [s] of the first goal, unless an earlier run of this session moved the arm."""
+"""Advice if the arm is stopped within `_FIRST_S` [s] of the first goal, unless an earlier run of this session moved it.
+"""
 
 _MOST_UNSEEN = 20
 """Number of progress reports that may be queued for the observer (about one second)."""
@@ -148,7 +149,7 @@ def _play(
 ) -> str:
     """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event.
 
-    lay: where the servos were when the arm's pose was checked.
+    lay: positions of the servos when the arm's pose was checked.
 
     Returns sentences about settings that another program changed during the run, and about an arm that does not stay in
     its rest pose without torque; "" if neither happened.
@@ -199,7 +200,7 @@ def _play(
 
 
 def _moved_without_torque(config: Config, bus: ServoBus, recorder: Recorder) -> str:
-    """Say how the arm has moved since the last sample before torque was cut; "" if nothing is known."""
+    """Describe how the arm has moved since the last sample before torque was cut; "" if nothing is known."""
     samples = recorder.samples
     if not len(samples) or bus.torque_off_report is None:
         return ""
@@ -223,8 +224,8 @@ def _try_again(bus: ServoBus, note: Note) -> None:
 
 
 def _why_silent(bus: ServoBus, stop: SafetyStop) -> str:
-    """Say that replies were late if they arrived after torque was cut. Otherwise, if no servo was heard, say which ones
-    answered later: a silent servo hides the replies of those after it.
+    """Report late replies that arrived after torque was cut. Otherwise, if no servo was heard, name those that answered
+    later: a silent servo hides the replies of those after it.
     """
     report = bus.torque_off_report
     if stop.unheard is None or report is None:
@@ -271,8 +272,8 @@ def _check_unchanged(bus: ServoBus) -> Settings:
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, modes_seen_ago: float) -> None:
     """Name settings that another program changed. They are read only once torque is off, because reading takes time.
 
-    Changes that can explain a stop are named before its message. Others, including any that may have followed the stop,
-    are named after it.
+    Changes that can explain why the run was stopped are named before the error's message. Others, including any that
+    may have been made later, are named after it.
     """
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return

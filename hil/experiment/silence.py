@@ -54,7 +54,7 @@ class Silence:
         self.any_missed = False
         """Whether any joint has missed the latest reply."""
         self.others_answer = False
-        """Whether some servos that seem silent are known to reply: a silent servo hides their replies."""
+        """Whether some servos are known to seem silent only because a silent servo hides their replies."""
 
     @property
     def is_busy(self) -> bool:
@@ -115,7 +115,9 @@ class Silence:
         return None
 
     def _delayed(self, seconds: float) -> str:
-        """Say that this computer caused `seconds` [s] of a silence; during lowering, only if it is known to be busy."""
+        """Attribute `seconds` [s] of a silence to this computer; "" if that is short or, during lowering, if the
+        computer is not known to be busy.
+        """
         is_told = seconds >= LATE_WAKE_UP_S and (self.is_busy or not self._already)
         return f", {_ms(seconds)} of it because this computer was busy" if is_told else ""
 

@@ -36,10 +36,14 @@ _REMEMBERED = 256
 """Number of latest goals kept."""
 
 _LONGEST_DELAY_S = 0.1
-"""Longest delay assumed for requests [s]; if a servo seems to hold an older goal, this is taken as a coincidence."""
+"""Longest assumed delay of requests [s]; if a goal that a servo reports equals one sent earlier than this, that counts
+as a coincidence.
+"""
 
 _HELD_BEFORE = 4
-"""If writes are lost, a servo may also hold one of the last `_HELD_BEFORE` goals sent before a status last matched."""
+"""If writes are lost, a servo may also hold one of the last `_HELD_BEFORE` goals sent before the latest status that
+matched.
+"""
 
 
 OLD_REPLIES = (
@@ -74,7 +78,7 @@ class StatusCheck:
         self._missed = [0] * len(config.joints)
         self._has_one_servo = [len(joint.ids) == 1 for joint in config.joints]
         self.longest_gap = 0.0
-        """Longest time for which this program has sent nothing [s]."""
+        """Longest time so far for which this program has sent nothing [s]."""
         self._goals: deque[Sequence[float]] = deque(maxlen=_REMEMBERED)
         self._cycles = 0
         # Per joint: goal in the latest status if it differs from that sent [A or V], the number of goals sent when they
@@ -150,7 +154,7 @@ class StatusCheck:
         """Return why a watchdog may have tripped, given how regularly this program has sent packets."""
         if self.longest_gap > 0.5 * self._armed * WATCHDOG_UNIT:
             return ": check its plug and cable, unless the computer kept this program waiting"
-        return ", or another program has set this register: check its plug and cable, and end other programs"
+        return ", or another program has set this register: check its plug and cable, and stop other programs"
 
     def _goal(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
         if abs(status.goal - sent) < self._half_tick[joint]:
@@ -216,7 +220,8 @@ class StatusCheck:
         return self._heard_instead() or refused
 
     def _never_sent(self, joint: int, held: float) -> bool:
-        """Whether the goal that a servo holds differs from every goal sent to any joint since a status last matched.
+        """Whether the goal that a servo holds differs from every goal sent to any joint since its latest status that
+        matched.
 
         The halves of a two-servo joint's goal may differ in age, so nothing is known about their sum.
         """
@@ -273,7 +278,7 @@ class StatusCheck:
 
 
 def _unlike_armed(longer: int) -> str:
-    """What a changed watchdog timeout means; longer: its increase [20 ms], 0 if the watchdog is off."""
+    """Describe the effect of a changed watchdog timeout. longer: its increase [20 ms]; 0 if the watchdog is off."""
     if not longer:
         return "is no longer protected"
     return f"stops by itself {'later' if longer > 0 else 'earlier'} than intended"

@@ -5,7 +5,7 @@ torque, the handlers only record the request, and the stream checks for it betwe
 the arm, then cuts torque; a second one cuts torque at once; further ones have no effect. While no servo has torque, a
 signal ends the program at once.
 
-A request stays in effect until the outermost block is left: even if the exception is swallowed, no further experiment
+A request stays in effect until the outermost block ends: even if the exception is swallowed, no further experiment
 starts.
 """
 
@@ -77,7 +77,7 @@ class StopRequest:
         return self._count > 1
 
     def check_again(self, asked: int) -> None:
-        """Raise StopRequested when more than `asked` signals have arrived."""
+        """Raise StopRequested if more than `asked` signals have arrived."""
         if self._count > asked:
             raise self._stop()
 

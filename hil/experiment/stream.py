@@ -1,11 +1,11 @@
 """The real-time loop: one exchange, one guard check and one recorded sample per tick.
 
-If ticks are far apart, the same goals are exchanged again in between, without recording. Every check thus sees an
-exchange at least every `hil.drivers.bus.CHECK_S`, whatever the rate of the experiment.
+If ticks are far apart, the exchange is repeated in between with the same goals, without recording. Every check thus
+sees an exchange at least every `hil.drivers.bus.CHECK_S`, whatever the rate of the experiment.
 
 The sequence is: rest; for each multisine a ramp in, the warm-up (only before the first), periods until two successive
 ones match, the remaining periods to be recorded, and a ramp out; then no current until the arm is at rest. If the cause
-of a stop allows it, the arm is braked before `run` raises; the caller that switched torque on switches it off.
+of a stop allows it, the arm is braked before `run` raises; the caller, which switched torque on, then switches it off.
 """
 
 import math
@@ -44,21 +44,21 @@ from hil.setup.session.servo_session import has_moved
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
 _STILL_STEPS, _FALSE_STEPS = 1, 4
-"""Largest change in the reading of a joint at rest, in encoder steps: the joint may rest between two steps. The
-second value is the distance that reported velocities must add up to before they count as false.
+"""Largest change in the reading of a joint at rest, in encoder steps: the joint may rest between two steps. The second
+value is the distance, also in steps, to which reported velocities must add up before they count as false.
 """
 
 _BY_OTHER_GOALS = {
     *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
-"""Causes of a stop that may be due to goals sent by another program."""
+"""Reasons for stopping that may be due to goals sent by another program."""
 
 _BY_LOST_TORQUE = {
     *(Cause.NOT_FOLLOWING, Cause.FROZEN, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
-"""Causes of a stop that may be due to a servo without torque. Its Torque Enable is then read before torque is cut."""
+"""Reasons for stopping that may be due to a servo without torque. Torque Enable is then read before torque is cut."""
 
 _BRAKING_WATCHDOG_S = 0.04
 """Timeout of the Bus Watchdog while the arm is braked [s]. It is shorter than during the experiment, which must allow
@@ -144,7 +144,7 @@ class Stream:
         self._repetition = Repetition(longest, len(bus.joints), self._pace.interval)
 
         self.modes_seen_ago = float("inf")
-        """Time from the latest correct read-back of the operating modes to a stop by the guard [s]."""
+        """Time from the latest correct read-back of the operating modes until the guard stopped the stream [s]."""
 
     def begins_at(self, positions: Sequence[float]) -> None:
         """Store the joints' last angles before torque is switched on [rad]; the first sample must agree with them."""
@@ -185,7 +185,7 @@ class Stream:
             try:
                 self._guard.torque_is_off(dead)
             except SafetyStop as lost:
-                symptom = re.split(r"[.:] ", str(error), maxsplit=1)[0].rstrip(".")  # without its other causes
+                symptom = re.split(r"[.:] ", str(error), maxsplit=1)[0].rstrip(".")  # without the other causes
                 lost.args = (f"{lost} Symptom: {symptom}.",)
                 lost.overruled = True
                 for note in getattr(error, "__notes__", ()):

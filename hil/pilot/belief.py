@@ -1,4 +1,4 @@
-"""The current belief about the arm: an ensemble drawn from the prior and updated by measured motion.
+"""The current belief about the arm: an ensemble drawn from the prior and updated with measured motion.
 
 Each recorded motion is assimilated by an ensemble smoother with multiple data assimilation (Emerick and Reynolds,
 Computers and Geosciences 55 (2013) 3). Every arm of the ensemble is given the real arm's commands, and is then updated
@@ -24,20 +24,20 @@ from hil.plan.stabiliser import feedback_of
 from hil.results.result import Result
 
 _FRICTION = ("viscous", "coulomb", "stribeck_rise")
-_FRICTION_CHANGE = 0.1  # relative standard deviation of friction from one day to another
+_FRICTION_CHANGE = 0.1  # relative standard deviation of friction from day to day
 
 _LINEAR = ("offset", "zero")
-"""Parameters of either sign, which are not represented by their logarithm."""
+"""Parameters that may have either sign, and are therefore not represented by their logarithms."""
 
 _TIMES = 160
 """Number of instants at which the measured and the simulated motion of a joint are compared."""
-_LINEAR_RANGE = 0.02  # rad, below which displacements are compared linearly, and above it by their logarithms
+_LINEAR_RANGE = 0.02  # rad; larger displacements are compared by their logarithms, smaller ones linearly
 _ERROR = 0.08
 """Assumed model error of a simulated displacement, relative to that displacement."""
 _LEAST_ERROR_STEPS = 1.5
 MOVED_STEPS = 26
 """Smallest range of motion for which a joint counts as having moved [encoder steps]."""
-_STILL = 0.02  # rad, allowed range of a simulated joint whose real counterpart stood still
+_STILL = 0.02  # rad, allowed range of motion of a simulated joint if the real one stood still
 _MOST_RAISES, _RAISE = 12, (0.05, 0.25)
 """If a simulated joint moves although the real one stood still, the logarithm of its friction is increased, at most
 `_MOST_RAISES` times, by a random amount from the range `_RAISE`.
@@ -56,7 +56,8 @@ _LEAST_SPREAD = 0.01  # relative model error, per doubling of the range of motio
 class Belief:
     """Arms that could be the real one.
 
-    coordinates (arms, parameters): logarithms of positive parameters; parameters of either sign are divided by `scale`.
+    coordinates (arms, parameters): logarithms of positive parameters; parameters that may have either sign are instead
+    divided by `scale`.
     scale: standard deviation in the prior (parameters,). fixed: parameters that do not vary. learned: number of
     updates.
     """
@@ -143,7 +144,9 @@ class Belief:
         return belief._without_strays(left, random)
 
     def _motions(self, config: Config, seen: Seen, arms: NDArray[np.int64] | None = None) -> Array:
-        """Motion (arms, joints, samples) [rad] of arms (given by index; default: all) under the recorded commands."""
+        """Motion (arms, joints, samples) [rad] of the arms with the given indices (default: all) under the recorded
+        commands.
+        """
         coordinates = self.coordinates if arms is None else self.coordinates[arms]
         ensemble = replace(self, learned=0, coordinates=coordinates).ensemble()
         poses = np.tile(seen.pose, (ensemble.size, 1))
@@ -162,7 +165,7 @@ class Belief:
         return replace(self, coordinates=x + change)
 
     def _without_strays(self, left: Array, random: np.random.Generator) -> "Belief":
-        """Replace arms that fit far worse than the rest by slightly perturbed copies of others."""
+        """Replace arms that fit far worse than the rest with slightly perturbed copies of others."""
         strays = left > _HOPELESS * np.median(left) + 1.0
         if not strays.any() or strays.all():
             return self

@@ -1,9 +1,9 @@
 """Breakaway of joints held by friction: torque rises from run to run, and a run ends soon after a joint moves.
 
 Just above a joint's static friction, motion grows quickly: on many of the plausible arms even a few percent more torque
-makes a joint exceed a limit. The guard is therefore given narrow limits for such joints, and the torque is raised by a
-constant ratio from run to run, up to the current limit. As soon as the joint moves and so reveals its friction, the arm
-is braked and the run ends.
+makes a joint exceed a limit. The guard is therefore given narrow position limits for such joints, and the torque is
+raised by a constant ratio from run to run, up to the current limit. As soon as the joint moves and so reveals its
+friction, the arm is braked and the run ends.
 
 A joint that gravity presses against an end stop also stands still until its torque lifts it. In the following runs, it
 would bounce on this end stop, which the model of a planar arm does not include.
@@ -25,17 +25,20 @@ from hil.pilot.options import PilotOptions
 from hil.pilot.seen import Seen
 
 _LEANS = 0.1
-"""Smallest absolute cosine of a link's angle at rest for which gravity may press the link against something."""
+"""Gravity may press a link against something if the absolute cosine of the link's angle at rest is at least this."""
 
 _AT_REST_RAD = 0.03
-"""Largest distance between an end stop and the joint's angle before the run [rad]."""
+"""Largest distance between the joint's angle before the run and an end stop that it rests against [rad]."""
 
 _UNEXPLAINED = 0.25
-"""Fraction of the torque that inverse dynamics without an end stop must leave unexplained for one to be suspected."""
+"""An end stop is suspected only if inverse dynamics without one leaves at least this fraction of the torque
+unexplained.
+"""
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
-    """Return `torque` (joints,) [N m], but `ratio` times the `former` torque for joints that stood `still`.
+    """Return the next torques (joints,) [N m]: `torque`, except that joints that stood `still` get `ratio` times the
+    `former` one.
 
     most: upper limit for those joints, set by the current limits (joints,) [N m].
     """

@@ -33,13 +33,13 @@ _LEAST_NOISE_SHARE = 0.005  # smallest noise, relative to a joint's largest torq
 _MODEL_SPREAD = 0.01  # of each parameter of links and drives, for effects that the model does not include
 _FEWEST_ROWS = 50
 _PEAK, _BREAKAWAY = 0.99, 1.15
-"""Dry friction of a joint that did not move: at least the quantile `_PEAK` of its torque, times `_BREAKAWAY`."""
+"""The dry friction of a joint that did not move is at least `_BREAKAWAY` times the quantile `_PEAK` of its torque."""
 _LEAST_FRICTION_SHARE = 1e-4
 _POSES = 12
 _HALVINGS = 6
 _LIGHTER, _LIGHTER_THAN_MEAN = 0.25, 0.5
-"""Smallest plausible inertia of a joint, as fractions of its inertia in the lightest arm of the prior and in the arm
-with the fitted parameters. The smaller result is the lower bound.
+"""Lower bound on the inertia of a joint, as fractions of its inertia in the lightest arm of the prior and in the arm
+with the fitted parameters; the smaller of the two values applies.
 """
 
 SIMULATED = 100

@@ -1,4 +1,4 @@
-"""Gains of the software spring and damper that hold a spatial arm to its path: as stiff as the sample rate allows.
+"""Gains of a spatial arm's software spring and damper, which hold it to its path: as high as the sample rate allows.
 
 Both act on a state that is `DELAY_SAMPLES` old. The damper must be weak enough for the lightest joint not to oscillate.
 A delayed spring drives the motion like a negative damper, so at a low rate the damping limits the stiffness.

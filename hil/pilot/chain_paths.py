@@ -1,4 +1,4 @@
-"""Paths for the pilot runs of a spatial arm: designed once for all steps and scaled down in the first ones."""
+"""Paths for the runs of a spatial arm's pilot: designed once for all steps, and scaled down in the first ones."""
 
 from dataclasses import dataclass
 

@@ -126,12 +126,15 @@ class ChainSearch(SafeShares):
         return found
 
     def limit_after(self, error: ExperimentError, found: Found) -> None:
-        """Reduce the largest allowed amplitude after a stopped run, unless it never settled or a joint stood still."""
+        """Reduce the largest allowed amplitude after a stopped run, unless the motion never settled or a joint did not
+        move.
+        """
         if not isinstance(error, NotSettled | DidNotMove):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
-        """Play a run and set `last` to its fraction of the amplitude; return the error that ended it early, or None.
+        """Play a run and set `last` to the fraction of the amplitude that it used; return the error that ended it
+        early, or None.
 
         Only errors that are informative about the arm are returned; all others are raised.
         """

@@ -55,7 +55,7 @@ ROOM = 1.2
 
 SATURATED = 0.98
 LEAST_SPREAD_SHARE = 0.1
-"""A smaller [arm.prior] spread is recommended only if it is at least this fraction of the configured one."""
+"""A smaller spread in [arm.prior] is recommended only if it is at least this fraction of the configured one."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,11 @@ class Found:
 class SafeShares:
     """The current belief about the arm, and the paths designed for it.
 
-    last: amplitude of the previous run. cap: largest amplitude after a run that exceeded a limit. Both are fractions of
-    the amplitude of `paths`, and are converted when these paths are replaced. tell: called with the progress of each
-    simulation of the arms. designing: called with the progress of each path's design. trying: called with a description
-    of each path and amplitude before it is simulated. simulated: motion simulated so far [s]. passed: on which sides of
-    its rest angle each joint has been in a run, as in `resting_stops`.
+    last: amplitude of the previous run. cap: largest allowed amplitude after a run that exceeded a limit. Both are
+    fractions of the amplitude of `paths`, and are converted when these paths are replaced. tell: called with the
+    progress of each simulation of the arms. designing: called with the progress of each path's design. trying: called
+    with a description of each path and amplitude before it is simulated. simulated: motion simulated so far [s].
+    passed: on which sides of its rest angle each joint has been in a run, as in `resting_stops`.
     """
 
     given: Config
@@ -93,7 +93,7 @@ class SafeShares:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether so much has been simulated that no further paths should be tried."""
+        """Whether so much motion has been simulated that no further paths should be tried."""
         return self.simulated > MOST_SIMULATED_S
 
     @property

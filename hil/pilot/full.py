@@ -52,9 +52,9 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
     """Play the full run; repeat it with less torque if it exceeded a limit, with other waves if it did not settle, and
     at higher frequencies if friction held a joint.
 
-    Friction may stop an arm in a different place in every period, however long it keeps moving, so each repetition
-    tolerates a larger difference. The fit does not need identical periods, and the verdict says how well they are
-    predicted.
+    Friction may stop an arm in a different place in every period, however many periods are played, so each repetition
+    tolerates a larger difference between periods. The fit does not need identical periods, and the verdict says how
+    well they are predicted.
     """
     run, say, options = search.run, search.player.say, search.options
     number = unlike = 0

@@ -4,8 +4,8 @@ so much friction that gravity cannot move a joint.
 The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction within a radian,
 and soft enough to leave most of the torque for the excitation.
 
-At a low sample rate, the delay of such a spring would drive the joint (`hil.plan.stabiliser`). The damper is then made
-stronger and the spring softer, as far as rate and gravity allow.
+At a low sample rate, such a spring would act so late that the joint would oscillate (`hil.plan.stabiliser`). The damper
+is then made stronger and the spring softer, as far as rate and gravity allow.
 """
 
 from math import ceil
@@ -25,14 +25,14 @@ _FREQUENCY = 0.7  # Hz, natural frequency of each joint on its own spring
 _DAMPING_RATIO = 0.35
 _OUTWEIGHS = 1.3  # relative to the largest destabilising gravity stiffness of all arms
 _FRICTIONS_PER_RADIAN = 1.5
-_HELD = 1.5  # friction over gravity's torque at one radian from rest: at 1 it holds the joint at any angle
+_HELD = 1.5  # ratio of friction to gravity's torque one radian from rest; at 1, friction holds the joint at any angle
 _DRIVEN = 0.8  # largest share of a joint's damping that the delay of its spring may cancel
 _TORQUE_SHARE = 0.35  # largest share of the torque limit at a deflection of 1 rad, beyond what gravity needs
 
 
 def wandering(config: Config, belief: Belief) -> Mask:
-    """Joints that need a spring (joints,): all joints of an arm that falls over or lies flat, otherwise those held by
-    friction.
+    """Joints that need a spring (joints,): all joints if the arm falls over or lies flat, otherwise those that friction
+    holds.
     """
     arm = belief.middle
     stiffness = gravity_stiffness(config, arm)
@@ -66,7 +66,7 @@ def proposed(config: Config, belief: Belief, springs: Mask) -> StabiliserConfig:
     inertia = np.median([_inertia(config, each) for each in parameters], axis=0)
     friction, viscous = (np.median(_per_joint(config, parameters, name), axis=0) for name in ("coulomb", "viscous"))
     limit = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
-    # Two coupled joints on such springs oscillate more slowly than each alone; gravity is added.
+    # Two coupled joints on such springs oscillate more slowly than each would alone; gravity is added.
     spring = np.maximum(inertia * (2 * np.pi * _FREQUENCY) ** 2, _FRICTIONS_PER_RADIAN * friction)
     stiffness = _OUTWEIGHS * away + np.minimum(spring, _TORQUE_SHARE * limit)
     damping = np.maximum(2 * _DAMPING_RATIO * np.sqrt(stiffness * inertia) - viscous, 0.0)

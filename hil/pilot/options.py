@@ -20,7 +20,9 @@ class PilotOptions:
     certain_share: float = 0.85
     """Fraction of a limit that a typical arm should reach."""
     certain_share_known: float = 0.68
-    """`certain_share` if the belief comes from an earlier result, whose uncertainty another run would hardly reduce."""
+    """Replaces `certain_share` if the belief comes from an earlier result: another run would hardly reduce its
+    uncertainty.
+    """
 
     pilot_period_share: float = 0.5
     """Period of a pilot run, relative to experiment.period."""
@@ -55,7 +57,8 @@ class PilotOptions:
     worthwhile_raise_far: float = 1.03
     """Replaces `worthwhile_raise` if much of the range is unused."""
     fair_share: float = 0.7
-    """If each joint of a typical arm reaches more than this fraction of a limit, little of the range counts as unused.
+    """If each joint of a typical arm reaches more than this fraction of a limit, little of the range is considered
+    unused.
     """
 
     wide_range: float = 0.74
@@ -66,11 +69,12 @@ class PilotOptions:
     falling_raise: float = 1.35
     """Maximum ratio of the torques in successive runs, for an arm that falls over when it is stopped."""
     falling_breakaway_raise: float = 1.2
-    """`breakaway_raise` for an arm that falls over when it is stopped."""
+    """Replaces `breakaway_raise` for an arm that falls over when it is stopped."""
     falling_share: float = 0.85
     """Fraction of the limits that runs may use on an arm that falls over when it is stopped."""
     min_falling_torque: float = 0.05
-    """Torque that is always allowed for an arm that falls over, as a fraction of what the current limit allows."""
+    """Torque always allowed for an arm that falls over when it is stopped, relative to the torque at the current limit.
+    """
     start_inside: float = 0.95
     """An arm that a stopped run left beyond its position limits is assumed to start within this fraction of its range,
     measured from the middle.

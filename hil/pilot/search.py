@@ -61,8 +61,8 @@ class Search:
     fast: Mask = field(init=False)
     """Joints that exceeded their velocity limit in the last run before moving by MOVED_STEPS (joints,)."""
     calm: Array = field(init=False)
-    """Cap on the torque (joints,) [N m], below that of all runs in which a joint exceeded its velocity limit before
-    moving by MOVED_STEPS; infinite if there were none.
+    """Cap on the torque (joints,) [N m]: it is lower than in all runs in which a joint exceeded its velocity limit
+    before moving by MOVED_STEPS; infinite if there were no such runs.
     """
 
     def __post_init__(self) -> None:
@@ -153,7 +153,8 @@ class Search:
         return np.asarray(swing > MOVED_STEPS * step)
 
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
-        """The largest amplitude that is safe for all plausible arms. share: fraction of each limit that they may use.
+        """The largest amplitude that is safe for all plausible arms. share: fraction of each limit that the motion may
+        use.
 
         If there is no such amplitude, the amplitude of the last run is used, or a smaller one if the real arm has
         exceeded a limit. Raises NoSafeTorque if there is no such amplitude and there has been no run yet.
@@ -278,8 +279,8 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """Return `found`. If it leaves much of the position range unused, try other waves too, and return the amplitude
-        whose motion covers the largest part of the range.
+        """Return `found` or, if it leaves much of the position range unused, the amplitude with other waves whose
+        motion covers more of the range.
         """
         options = self.options
         limited = (found.peak_torque >= options.at_limit * most_torque(config)).all() or self.cap is not None
@@ -325,8 +326,8 @@ class Search:
         return np.asarray(np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0))
 
     def _refuse_velocity_limit(self, fast: Mask, held: Mask) -> NoReturn:
-        """Raise ExperimentError because of the velocity limit. fast: joints that exceeded it. held: joints that did not
-        move even at full torque.
+        """Raise ExperimentError because the velocity limit is too low. fast: joints that exceeded it. held: joints that
+        did not move even at full torque.
         """
         said = "; ".join(
             f"{joint.name}: velocity_limit = {joint.velocity_limit:g} rad/s, {MOVED_STEPS} encoder steps are "

@@ -1,4 +1,4 @@
-"""Commands and motion of a run from its first ramp on; the pilot learns from them however the run ended."""
+"""Commands and motion of a run from its first ramp on; the pilot learns from them no matter how the run ended."""
 
 from dataclasses import dataclass
 

@@ -47,7 +47,7 @@ class Step:
 
     @property
     def within(self) -> bool:
-        """Whether all measured peaks that have a limit stayed within the peaks predicted for 99 % of the arms."""
+        """Whether no measured peak of a limited quantity exceeded the peak predicted for 99 % of the arms."""
         low, high, velocity = self.seen[:GUARDED]
         bounds = self.quantile
         return bool((low >= bounds[0]).all() and (high <= bounds[1]).all() and (velocity <= bounds[2]).all())
@@ -162,7 +162,7 @@ def tells_of_the_arm(error: ExperimentError) -> bool:
 
 
 def _stood_still(config: Config, folder: RunFolder, error: ExperimentError) -> bool:
-    """Whether the only anomaly was a joint that did not move at all, because friction is larger than assumed."""
+    """Whether the only anomaly was that a joint did not move at all, because friction is larger than assumed."""
     if not isinstance(error, SafetyStop) or error.cause is not Cause.UNEXPECTED or error.overruled:
         return False
     position = load_samples(folder.samples_path, len(config.joints))["position"]

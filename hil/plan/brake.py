@@ -1,4 +1,4 @@
-"""The first part of a stop, if possible: braking with currents that oppose the joints' velocities.
+"""Braking, the first stage of stopping an arm where possible: currents oppose the joints' velocities.
 
 Braking is limited in time and stays within the current limits. It ends at once when a reply or deadline is
 missed, a servo raises an alert, a second signal arrives, or a joint speeds up, as it does if its motor turns the wrong
@@ -72,7 +72,7 @@ def braking_gains(config: Config, interval: float | None = None) -> list[float]:
 class Brake:
     """Computes goal currents that oppose the joints' velocities.
 
-    recent: the exchanges before the stop. Without them, a joint is braked only once two of its states are known.
+    recent: the exchanges before the stop. Without these, a joint is braked only once two of its states are known.
     """
 
     def __init__(self, config: Config, interval: float | None = None, recent: RecentMotion | None = None) -> None:
@@ -101,7 +101,9 @@ class Brake:
         ]
 
     def _pushes(self, reported: list[float], visible: list[float]) -> bool:
-        """Whether a joint is clearly faster than when braking began, judging by its reported or its visible speed."""
+        """Whether a joint is clearly faster than when braking began, according to its reported velocity or its change
+        of position.
+        """
         if self._first is None:
             self._first = reported, visible
         share = GETS_FASTER if self._samples < self._first_samples else STILL_FASTER

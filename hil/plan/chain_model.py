@@ -1,4 +1,4 @@
-"""Assumed model of a spatial arm before and between runs: its description, and the torque that a motion requires."""
+"""Assumed model of a spatial arm before and between runs: the arm's description, and the torque of a motion."""
 
 from dataclasses import dataclass
 

@@ -25,12 +25,12 @@ from hil.plan.chain_model import ChainTorque, KnownChain, described_torque, know
 from hil.plan.plan import Plan, Segment, make_plan, plan_with
 
 SETTLE_IN = 0.3  # s over which the feed-forward is faded in and out
-TORQUE_SHARE = 0.8  # fraction of a joint's torque limit that a path may use; the rest allows for model errors
+TORQUE_SHARE = 0.8  # fraction of a joint's torque limit that a path may use; the remainder allows for model errors
 
 
 @dataclass(frozen=True)
 class PathSegment(Segment):
-    """A path. Its multisine is the torque that is commanded for the path.
+    """A segment that follows a path; its multisine is the torque that is commanded for the path.
 
     way, back: goals of the transitions from and to the rest pose (samples, joints) [A]. paths: the desired motions
     (transition, period, transition back). thought: the assumed model from which the torque was computed. peaks: largest
@@ -66,7 +66,7 @@ def plan_of(config: Config) -> Plan:
 
 
 def missing_path(config: Config) -> str:
-    """Return what to do about a missing [joint_path], which a spatial arm without a pilot needs; "" if it is there."""
+    """Return advice if [joint_path], which a spatial arm without a pilot needs, is missing; "" if it is given."""
     if config.joint_path is not None:
         return ""
     return (
@@ -96,7 +96,7 @@ def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str,
 
 
 def lowering_samples(config: Config) -> int:
-    """Maximum number of samples in a stop that lowers the arm, including braking and coming to rest."""
+    """Maximum number of samples for lowering a stopped arm, including braking and coming to rest."""
     safety = config.safety
     return round((safety.lower_time + 1.0 + 2.0 * SETTLE_IN) * config.experiment.rate)
 

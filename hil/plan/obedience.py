@@ -1,11 +1,11 @@
 """Detection of reversed motors while an arm is being lowered: such a motor speeds its joint up instead of braking it.
 
-While the torque is constant, a reversed motor cannot be distinguished from an external push: either way, the arm moves
-as if an additional torque acted on the joint. The goal of a suspect joint is therefore removed briefly, while the other
-goals are held. Unexplained torque that comes from the joint's own motor then falls in proportion to the motor's torque,
-through the same filter; torque from a push does not. If the unexplained torque falls earlier or later than that, the
-joint is tested again. The test is so short that an unpowered joint gains less speed from gravity than a reversed motor
-would give it.
+While the torque is constant, a reversed motor cannot be distinguished from an external push: in both cases, the arm
+moves as if an additional torque acted on the joint. The goal of a suspect joint is therefore removed briefly, while the
+other goals are held. Unexplained torque that comes from the joint's own motor then falls in proportion to the motor's
+torque, through the same filter; torque from a push does not. If the unexplained torque falls earlier or later than the
+motor's torque, the joint is tested again. The test is so short that an unpowered joint gains less speed from gravity
+than a reversed motor would give it.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ MOST_TURNED = 3.0
 
 UNEVEN = 0.3
 """Largest deviation of the unexplained torque from a drop in proportion to the joint's own torque, relative to the
-total drop; a larger deviation shows that it has another cause.
+total drop; a larger deviation shows that the unexplained torque has another cause.
 """
 
 MOST_UNEVEN = 3
@@ -108,7 +108,7 @@ class Obedience:
         return self._tests[joint] is not None
 
     def is_pushed(self, joint: int) -> bool:
-        """Whether a test has shown that something is pushing this joint or has pushed it."""
+        """Whether a test has shown that something is pushing, or has pushed, this joint."""
         return self._pushed[joint]
 
     def question(self, joint: int, now: float) -> bool:

@@ -70,7 +70,7 @@ class Plan:
     rest_samples: int
     end_samples: int
     brake_samples: int
-    """Maximum number of exchanges for which a stop brakes the joints."""
+    """Maximum number of exchanges for which the joints are braked when the arm is stopped."""
     max_settling_periods: int
     periods: int
     settle_within: float
@@ -78,7 +78,7 @@ class Plan:
     warm_up_periods: int = 0
     """Number of warm-up periods of the first multisine, played before those that may be used."""
     lower_samples: int = 0
-    """Maximum number of samples for lowering a spatial arm after a stop."""
+    """Maximum number of samples for lowering a spatial arm that has been stopped."""
 
     def first_segment(self) -> "Plan":
         return replace(self, segments=self.segments[:1])
@@ -97,7 +97,7 @@ class Plan:
 
     @property
     def expected(self) -> int:
-        """Number of samples if the second period is already settled, as on most arms."""
+        """Number of samples if the motion has settled by the second period, as it does on most arms."""
         played = sum((1 + self.periods) * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
         return self.rest_samples + self.warm_up_samples + played
 

@@ -115,7 +115,7 @@ class RecentMotion:
         ]
 
     def is_old(self, joint: int) -> bool:
-        """Whether the joint's readings have stayed exactly the same for longer than its velocity allows."""
+        """Whether the joint's readings have stayed exactly the same for longer than the reported velocity allows."""
         last = self._states[-1] if self._states else None
         if last is None:
             return False
@@ -132,9 +132,7 @@ class RecentMotion:
         return abs(velocity) > self._fastest[joint]
 
     def travels(self, joint: int) -> list[Travel]:
-        """The changes of a joint's position over the short and the long span; none if the joint has replied only
-        once.
-        """
+        """The changes of a joint's position over the short and the long span; empty if it has replied only once."""
         states = [state for state in self._states if not isnan(state.position[joint])]
         if len(states) < 2 or isnan(self._states[-1].position[joint]):
             return []

@@ -20,8 +20,8 @@ switching it off takes some time.
 
 BRIDGED_ALONE_S = 0.028
 """How long servos may fail to reply while an arm is being lowered and another servo replies [s]. The silent servo's ID
-may have changed: then only its Bus Watchdog can stop it, and its timeout starts anew with every packet on the bus,
-whichever servo the packet is for.
+may have changed: then only its Bus Watchdog can stop it, and the watchdog's timeout starts anew with every packet on
+the bus, even one for another servo.
 """
 
 
@@ -53,7 +53,7 @@ def bridged_alone_limit(config: Config) -> Limit:
 
 
 def late_limit(config: Config) -> Limit:
-    """How long deadlines may be missed in succession."""
+    """For how long consecutive deadlines may be missed."""
     safety = config.safety
     if safety.max_late is not None:
         chosen = Limit((safety.max_late + 0.5) / config.experiment.rate, f"safety.max_late = {safety.max_late}")

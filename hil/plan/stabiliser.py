@@ -26,7 +26,7 @@ INTEGRAL_TIME_S = 1.0
 
 BALANCED_RAD = 0.02
 """Deviation from the rest pose below which the integral stops growing [rad]: friction can hold an arm that is this
-close to balance.
+close to its rest pose.
 """
 
 

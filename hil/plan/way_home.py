@@ -1,4 +1,5 @@
-"""Path along which a stop lowers a spatial arm: from any pose to the rest pose, clear of obstacles, in bounded time.
+"""Path along which a stopped spatial arm is lowered: from any pose to the rest pose, clear of obstacles, in bounded
+time.
 
 The path is straight in joint space if a straight path is clear. Otherwise it leads straight to the first reachable pose
 of the planned transition from the rest pose, and then back along that transition, which is known to be clear.
@@ -110,6 +111,6 @@ def _line(first: Array, last: Array) -> Array:
 
 
 def _lengths(corners: Array) -> Array:
-    """Travel of the joint that moves most between successive corners (corners - 1,) [rad]."""
+    """Travel between successive corners (corners - 1,) [rad], of the joint that moves most."""
     lengths: Array = np.abs(np.diff(corners, axis=1)).max(axis=0)
     return lengths

@@ -18,8 +18,8 @@ Kind = Literal["line", "broad", "dashed", "points", "dots", "area", "steps"]
 class Series:
     """One curve.
 
-    x, y: coordinates (n,), with a gap at each NaN. kind: `area` fills between y and `low`; for `steps`, x holds the n +
-    1 edges.
+    x, y: coordinates (n,), with a gap at each NaN. kind: with `area`, the area between y and `low` is filled; with
+    `steps`, x holds the n + 1 edges.
     """
 
     name: str
@@ -56,7 +56,7 @@ Figure = Chart | Matrix
 
 
 def thin(x: Array, y: Array, most: int) -> tuple[Array, Array]:
-    """Reduce a curve to about `most` points: the lowest and highest of each group of points, in order."""
+    """Reduce a curve to about `most` points: the lowest and the highest point of each group, in order."""
     if len(x) <= most:
         return x, y
     count = len(x) // (most // 2)

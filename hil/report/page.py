@@ -33,8 +33,9 @@ from hil.report.svg import NARROW, WIDE, draw_svg
 
 FILE_NAME = "report.html"
 MOST_POINTS = 70_000
-"""Maximum total number of points in all curves of a page, counted in the wide versions of the figures: twice the number
-on a planar arm's page."""
+"""Largest total number of points in all curves of a page, counted in the wide versions of the figures: twice as many as
+on a planar arm's page.
+"""
 FEWEST_POINTS = 600
 _CODE = re.compile("`([^`]+)`")
 SCRIPTS = ("page.js", "spatial.js")

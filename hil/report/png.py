@@ -42,7 +42,7 @@ def _draw_chart(axes: Any, chart: Chart) -> None:
         legend = axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
         for handle in legend.legend_handles:
             if hasattr(handle, "set_markersize"):
-                handle.set_markersize(7)  # at their size in the plot, dots would be invisible
+                handle.set_markersize(7)  # dots as small as in the plot would be invisible
 
 
 def _draw_series(axes: Any, series: Series) -> None:

@@ -71,7 +71,7 @@ def _verdict(shown: _Shown) -> Section:
 
 
 def _prediction(shown: _Shown) -> Section | None:
-    """The section on the longest recording; None if nothing was simulated."""
+    """The section that shows the longest recording; None if nothing was simulated."""
     longest = max(shown.recordings, key=lambda each: each.time.size)
     if not np.isfinite(longest.predicted).any():
         return None

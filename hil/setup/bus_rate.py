@@ -29,7 +29,7 @@ PATIENCE_S = 0.05
 AGAIN_AFTER_S = 0.5
 """If the configured rate seems too high for the bus, the bus is measured again after this time [s]."""
 SHARE = 0.9
-"""Fraction of a period that the exchange may take; the rest is left for the computer."""
+"""Fraction of a period that the exchange may take; the remainder is left for the computer."""
 RATE_MARGIN = 1.2
 """Minimum ratio of the measured rate to the rate chosen from it, so that a later measurement confirms the choice."""
 
@@ -38,8 +38,9 @@ RATE_MARGIN = 1.2
 class ExchangeMode:
     """Measured timing of one exchange mode.
 
-    median_s, longest_s: round trips [s]. usual_s, slowest_s: 90 % quantile and median of the round trips with the
-    slowest kind of read [s]. lost: number of exchanges, out of CYCLES, with replies that were lost, not just late.
+    median_s, longest_s: median and maximum of the round trips [s]. slowest_s: median of the round trips with the
+    slowest kind of read [s]. usual_s: `slowest_s` plus the 90 % quantile of how much each round trip exceeds the median
+    for its kind of read [s]. lost: number of exchanges, out of CYCLES, with replies that were lost, not just late.
     """
 
     one_write: bool
@@ -92,7 +93,7 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
     """Measure every exchange mode, and check whether the configured one sustains `wanted` [Hz]; see `measure_modes`."""
     modes = measure_modes(bus)
     if _configured(bus, modes).rate < wanted:
-        # A busy computer delays exchanges for a while, a slow bus delays them always.
+        # A busy computer delays exchanges only for a while, a slow bus always.
         bus.port.clock.wait_until(bus.port.clock.now() + AGAIN_AFTER_S)
         modes = [_faster(*pair) for pair in zip(modes, measure_modes(bus), strict=True)]
     used = _configured(bus, modes)
@@ -101,7 +102,9 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
 
 
 def seldom_as_measured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> str:
-    """Return `seldom_read_back` for the configured exchange mode with its measured timing. Raises DriverError."""
+    """Call `seldom_read_back` with the measured timing of the configured exchange mode, and return its warning. Raises
+    DriverError.
+    """
     used = _configured(bus, modes)
     exchange = bus.make_exchange(fast=used.fast, one_write=used.one_write)
     bus.add_read_back(exchange)
@@ -134,7 +137,7 @@ def _faster(first: ExchangeMode, second: ExchangeMode) -> ExchangeMode:
 def measure_modes(bus: ServoBus) -> list[ExchangeMode]:
     """Measure every exchange mode on servos whose torque is off, without changing their goals. Raises DriverError.
 
-    Every tenth exchange includes the slow reads, so that their duration counts.
+    Every tenth exchange includes the slow reads, so that their duration is taken into account.
     """
     goals = [servo.read(drive.mode.goal_register) for drive, servo in bus.drives.items()]
     reads = (True, False) if bus.knows_fast_sync_read() else (False,)

@@ -39,7 +39,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Moved:
-    """Outcome of moving one joint by hand."""
+    """What happened when one joint was moved by hand."""
 
     joint: str
     asked: str
@@ -67,7 +67,8 @@ def guided(
 ) -> Iterator[Moved]:
     """Ask for each joint in turn to be moved in its positive direction, and compare the motion with the description.
 
-    read: angles of all joints [rad]. read_drives: angles of a joint according to each of its servos [rad].
+    read: returns the angles of all joints [rad]. read_drives: returns a joint's angle according to each of its servos
+    [rad].
     """
     arm, up = described_arm(config), base_up(config)
     for index, joint in enumerate(config.joints):
@@ -81,7 +82,7 @@ def guided(
 def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Array) -> Moved:
     """Compare a motion `change` (joints,) [rad] with the requested one.
 
-    drives: motion of the requested joint according to each of its servos [rad], in the order of the servos.
+    drives: motion of the requested joint according to each of its servos, in their order [rad].
     """
     joint = config.joints[asked_for]
     most = int(np.argmax(np.abs(change)))

@@ -18,7 +18,9 @@ _GOAL_PWM = "Goal PWM"
 """Register that limits the voltage in current mode. After the watchdog has tripped, a value of 0 proves nothing."""
 
 _BESIDE = frozenset({*PROTECTIVE, STATUS_LEVEL}) - {SECONDARY_ID}
-"""Settings that cannot explain a stop (except a Status Return Level of 0) but are named along with others that can."""
+"""Settings that cannot explain why a run was stopped (except a Status Return Level of 0), but are named along with
+others that can.
+"""
 
 _REGISTERS = (
     _MODE,
@@ -36,7 +38,7 @@ WRITTEN = frozenset({"Operating Mode", "Current Limit", _GOAL_PWM})
 """Settings that this program writes itself."""
 
 _LATE = frozenset({Cause.LATE, Cause.MISSING})
-"""Causes of a stop that a longer Return Delay Time can explain."""
+"""Reasons for stopping a run that may be due to a longer Return Delay Time."""
 
 _MOVED = frozenset(
     {
@@ -54,28 +56,29 @@ _MOVED = frozenset(
         Cause.EARLY_MOTION,
     }
 )
-"""Causes of a stop that changed settings other than Return Delay Time can explain."""
+"""Reasons for stopping a run that may be due to changed settings other than Return Delay Time."""
 
 EXPLAINED = _MOVED | _LATE
 
 _AT_A_LIMIT = frozenset({Cause.POSITION, Cause.VELOCITY})
-"""Causes of a stop that excessive torque by itself can explain."""
+"""Reasons for stopping a run that may be due to excessive torque alone."""
 
 _MODES_SEEN_S = 0.06
-"""If the operating modes were read back less than this time [s] before a stop, a mode that differs may have been
-changed after the stop.
+"""If the operating modes were read back less than this time [s] before the run was stopped, a mode that differs may
+have been changed afterwards.
 """
 
 Settings = Mapping[tuple[Joint, str], int]
 
 
 def settings_now(bus: ServoBus, before: Settings | None = None) -> Settings:
-    """Read the settings that determine how servos move, what they report and when they protect themselves.
+    """Read the settings that determine how servos move, what they report and when they shut down.
 
     Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
-    to an earlier request. If the two readings differ, the value is unknown and omitted, as are all values of a
-    servo whose ID is read wrongly: its replies are late, so even equal values may be those of other registers. Values
-    that differ from `before` are confirmed once more, since another program would be blamed for the change.
+    to an earlier request. If the two readings differ, the value is unknown and omitted. If a servo's ID register does
+    not read as its ID, all its values are omitted: its replies are late, so even equal values may be those of other
+    registers. Values that differ from `before` are confirmed once more, since another program would be blamed for the
+    change.
     """
     found: dict[tuple[Joint, str], int] = {}
     report = bus.torque_off_report
@@ -112,7 +115,7 @@ def _confirmed(bus: ServoBus, before: Settings, found: Settings) -> Settings:
 def changed_settings(before: Settings, after: Settings, cause: Cause | None = None) -> str:
     """Return a message that names the settings that differ; "" if there are none, or if none can explain the stop.
 
-    cause: the cause of a stop. Settings that cannot explain it are omitted, except for those in `_BESIDE`.
+    cause: why the run was stopped. Settings that cannot explain this are omitted, except for those in `_BESIDE`.
     """
     differing = {each: value for each, value in before.items() if after.get(each, value) != value}
     if not any(_may_explain(each[1], cause, after[each]) for each in differing):
@@ -130,7 +133,9 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
 
 
 def _swapped(before: Settings, after: Settings) -> tuple[Joint, Joint] | None:
-    """Return a servo that now has all the settings that another had, and that other servo; None if there is no pair."""
+    """Return two servos, the first of which now has all the settings that the second had; None if there is no such
+    pair.
+    """
     old, new = _by_joint(before), _by_joint(after)
     for first, second in permutations(old, 2):
         if old[first] != old[second] == new.get(first):
@@ -146,7 +151,8 @@ def _by_joint(settings: Settings) -> dict[Joint, dict[str, int]]:
 
 
 def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago: float) -> str:
-    """Return a note for the message of a stop at a limit: the operating mode may have been changed after the stop.
+    """Return a note for a run that was stopped at a limit: the operating mode may have been changed after it was
+    stopped.
 
     Returns "" if other settings changed too, or if the change may have caused the stop.
 
@@ -160,7 +166,7 @@ def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago
 
 
 def _may_explain(register: str, cause: Cause | None, now: int) -> bool:
-    """Whether a change to `now`, the register's present value, may explain a stop."""
+    """Whether a change to `now`, the register's present value, may explain why the run was stopped."""
     if register == STATUS_LEVEL and now == 0:
         return cause in (None, Cause.MISSING)
     if cause is None or register in _BESIDE:

@@ -1,4 +1,4 @@
-"""Generate the commented TOML file of an arm from `ArmAnswers`."""
+"""Generate an arm's TOML file, with comments, from `ArmAnswers`."""
 
 import json
 import math
@@ -9,10 +9,10 @@ from hil.drivers.servo_model import Mode, Published, servo_model
 from hil.drivers.servo_prior import stall_torque
 
 STANDARD_GRAVITY = 9.81
-_OF_STALL = 0.3  # of the stall current or the supply voltage; initial limit
+_OF_STALL = 0.3  # initial limit, as a fraction of the stall current or the supply voltage
 _FASTEST = 10.0  # rad/s, initial limit of servos that could turn faster
 _USUAL_STALL = 4.1  # N m, stall torque of an XM430
-_CYCLE_BYTES = 39  # on the wire per servo: goal, request and reply
+_CYCLE_BYTES = 39  # per servo on the wire: goal, request and reply
 RATES = (400, 300, 250, 200, 160, 125, 100, 80, 64, 50, 40, 32, 25, 20)
 """Sample rates [Hz] for a new file, spaced so that rounding down costs at most a quarter of the possible rate."""
 
@@ -185,7 +185,7 @@ def _rate_meaning(arm: ArmAnswers) -> str:
 
 
 def _exchange(arm: ArmAnswers) -> list[str]:
-    """Return the [port] settings, other than the defaults, that the measured rate requires."""
+    """Return the [port] settings that the measured rate requires, except those that are the default."""
     if arm.measured is None:
         return []
     one_write = [] if arm.measured.one_write else [_line("one_write = false", "this bus is faster with two writes")]

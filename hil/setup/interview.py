@@ -50,7 +50,9 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
             "Set it to 0 with DYNAMIXEL Wizard 2.0, then run the same command again."
         )
     if homing := [f"{one.title}: {offset}" for one in handles if (offset := ignored_homing(one))]:
-        raise ExperimentError(f"Homing Offset is ignored now ({'; '.join(homing)}). {APPLY_HOMING}, with hil init.")
+        raise ExperimentError(
+            f"Homing Offset is currently ignored ({'; '.join(homing)}). {APPLY_HOMING}, with hil init."
+        )
     names = [_name(number, found, ask) for number, found in enumerate(chosen)]
     stance = _stance(ask, say)
     tilt = (
@@ -89,8 +91,8 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
 
 
 def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: Ask, say: Say) -> list[int]:
-    """Return the Present Positions in the rest pose. A hanging arm is read twice, the second time after a push, since
-    friction may hold its joints to one side.
+    """Return the Present Positions in the rest pose. The pose of a hanging arm is read twice, the second time after a
+    push, since friction may hold its joints away from the vertical.
     """
     ask(_POSE[stance], "")
     first = [servo.read("Present Position") for servo in handles]

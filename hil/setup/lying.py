@@ -1,4 +1,5 @@
-"""The pose in which a spatial arm lies before a run. The motion starts and ends there, not exactly at arm.rest_pose.
+"""The pose in which a spatial arm lies before a run. The motion starts and ends there rather than exactly at
+arm.rest_pose.
 
 If the motion started at arm.rest_pose, the stabiliser would pull the arm there as soon as torque is switched on,
 perhaps against an end stop.
@@ -25,7 +26,7 @@ NEAR_RAD = 0.02
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
 """Smallest reported motion after torque is cut, and largest deviation from the rest pose before torque is cut [rad]."""
 
-_LONGEST_SAG_S = 3.0  # wait for an arm that moves after torque off
+_LONGEST_SAG_S = 3.0  # longest wait for an arm that moves after torque is cut
 
 _LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
 """Longest wait for an arm to come to rest [s], interval between checks [s], and smallest change between two checks that

@@ -52,7 +52,7 @@ def real_time() -> Iterator[list[Granted]]:
 
 @contextmanager
 def on_time(clock: Clock) -> Iterator[list[Granted]]:
-    """Like `real_time` on the wall clock. On a virtual clock, nothing can be late, so no setting is requested."""
+    """With a wall clock, act as `real_time` does. On a virtual clock, nothing can be late, so nothing is requested."""
     if isinstance(clock, WallClock):
         with real_time() as granted:
             yield granted

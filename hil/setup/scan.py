@@ -23,8 +23,8 @@ _PATIENCE_S = _SLOT_S * (MAX_ID + 1)
 _STATUS_BYTES = 14
 
 _DIFFERENT = ("Present Position", "Realtime Tick")
-"""Registers whose values differ between any two servos. If two servos have the same ID, equal replies merge into one,
-but different ones corrupt each other.
+"""Registers that hardly ever have the same value on two servos. If two servos have the same ID, equal replies merge
+into one, but different ones corrupt each other.
 """
 
 
@@ -78,7 +78,7 @@ Watch = Callable[[Asking], None]
 
 
 def serial_ports() -> list[tuple[str, str]]:
-    """Device and description of every serial port of this machine to which hardware is connected."""
+    """Device and description of every serial port on this machine to which hardware is connected."""
     return [(port.device, port.description) for port in list_ports.comports() if port.hwid != "n/a"]
 
 

@@ -25,7 +25,7 @@ _LONG_RETURN_DELAY_US = 20
 def check_servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> Iterator[Finding]:
     """Check one servo; stop early if it does not answer or is of another model.
 
-    Nothing is written, except to restore settings that an earlier program changed and did not restore.
+    Nothing is written except settings that an earlier program changed and did not restore.
     """
     where = str(joint)
     try:
@@ -118,7 +118,7 @@ def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: S
     torque = servo.read("Torque Enable")
     fix = "Another program is driving it: stop that program first, or power-cycle the servo."
     if torque and servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
-        fix = "A program that has ended left it on, and the servo's watchdog has tripped. Power-cycle the servo."
+        fix = "A program left it on when it ended, and the servo's watchdog has tripped. Power-cycle the servo."
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
 
 

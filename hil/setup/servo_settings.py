@@ -43,7 +43,7 @@ def open_servo(port: Port, servo_id: int) -> Servo:
     if servo.read("Torque Enable"):
         fix = "Stop the program that is driving it, then try again."
         if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
-            fix = "A program that has ended left it on, and the servo's watchdog has tripped. Power-cycle the servo."
+            fix = "A program left it on when it ended, and the servo's watchdog has tripped. Power-cycle the servo."
         raise WrongSetting(f"{servo.title} has torque on, which locks its EEPROM. {fix}")
     return servo
 

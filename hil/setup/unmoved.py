@@ -1,7 +1,7 @@
 """Check that, until torque is switched on, the arm stays in the pose in which it was first read.
 
-A change of its reported angles means that they are no longer correct: a horn has slipped, another servo answers, or
-another program has changed Homing Offset.
+If its reported angles change, they are no longer correct: a horn has slipped, another servo answers, or another program
+has changed Homing Offset.
 """
 
 import math
@@ -17,7 +17,7 @@ MOST_RAD = 0.05
 """Largest motion allowed before torque is switched on [rad]; the guard allows the same before the start."""
 
 STIRRED_RAD = 0.004
-"""Smallest motion that encoder noise cannot explain [rad]: the arm is then not at rest."""
+"""Smallest motion that encoder noise cannot explain [rad]; an arm that moves this far is not at rest."""
 
 Lies = Mapping[Joint, int]
 """Present Position of each servo [ticks]."""
@@ -59,5 +59,5 @@ def refuse_moved(before: Lies, now: Lies, bus: ServoBus) -> None:
 
 
 def _turned(drive: Joint, before: Lies, now: Lies) -> float:
-    """Angle between two readings [rad], within half a turn: a servo that was switched off forgets whole turns."""
+    """Angle between two readings [rad], within half a turn, because a servo that was switched off loses whole turns."""
     return math.remainder((now[drive] - before.get(drive, now[drive])) * drive.position_unit, math.tau)

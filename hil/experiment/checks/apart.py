@@ -12,8 +12,8 @@ from hil.drivers.joint import Joint
 from hil.drivers.servo_model import Mode
 
 ALLOWED_RAD = 0.1
-"""Allowed change of the difference between the angles of two servos [rad], for backlash of both gear trains, encoder
-nonlinearity, and twist of the joint between the servos.
+"""Largest accepted change of the difference between the angles of two servos [rad]. It allows for backlash in both gear
+trains, encoder nonlinearity, and twist of the joint between the servos.
 """
 
 
@@ -26,7 +26,7 @@ def opposed(joint: Joint) -> str:
 
 
 def without_torque(joint: Joint) -> str:
-    """Say why a joint may receive no torque although no fault is reported.
+    """Explain why a joint may receive no torque although no fault is reported.
 
     A broken wire or winding is visible in the motor current, which the guard compares with its goal, but not in the
     applied voltage or the supply current.
@@ -37,7 +37,7 @@ def without_torque(joint: Joint) -> str:
 
 
 def causes_of_standstill(joint: Joint) -> str:
-    """Say why a joint that should move may stand still."""
+    """List the reasons why a joint that should move may stand still."""
     said = f"Something is blocking it, {without_torque(joint)}"
     if asked := opposed(joint):
         return f"{said}, its encoder is frozen, or {asked}"
@@ -45,7 +45,7 @@ def causes_of_standstill(joint: Joint) -> str:
 
 
 class Apart:
-    """Compares each joint's other servos with its first servo."""
+    """Compares the first servo of each joint with its other servos."""
 
     def __init__(self) -> None:
         self._first: dict[tuple[int, int], float] = {}

@@ -7,15 +7,15 @@ velocity must equal the change in position. The difference,
 
 is tracked with three fading memories (leaky integrators): a short one, which reveals a sudden fault at once; a long
 one, which reveals a gradual fault; and a slow one, which reveals creep. Encoder noise and rounding of positions do not
-accumulate in this difference. The contributions of a healthy servo are known:
+accumulate in this difference. The contributions that a healthy servo makes to it are known:
 
 - a velocity that lags by tau, because the servo filters it: tau times (velocity minus its mean over the memory). Any
   lag up to `LAG_S` is accepted;
 - a velocity with a scale error: the same fraction of the distance covered within the memory, at most `SCALE`;
 - a velocity that is rounded towards zero, or always downwards (a servo may do either). In the slow memory, rounding
-  towards zero adds one register step times the excess of time in one direction over the other. Rounding downwards adds
-  a bias of up to half a step times the time in motion, which is accepted unless the motion so far rules it out
-  (`hil.experiment.velocity.bias`). While the register shows zero, motion below one step does not count;
+  towards zero adds one register step times the difference between the times of motion in the two directions. Rounding
+  downwards adds a bias of up to half a step times the time in motion, which is accepted unless the motion so far rules
+  it out (`hil.experiment.velocity.bias`). While the register shows zero, motion below one step does not count;
 - the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where a
   fraction `CURVED` of the change of velocity times the interval remains. They do not cancel where the velocity jumps:
   in the slow memory, which contains many jumps, their sum is a random walk.
@@ -56,8 +56,8 @@ margin for rounding errors.
 """
 
 UNSURE_RAD, LONG_UNSURE_RAD, SLOW_UNSURE_RAD = 0.02, 0.045, 0.04
-"""Tolerances of the memories [rad]: for rounding, encoder noise, and, except in the slow one, a velocity that is
-rounded towards zero.
+"""Tolerances of the memories [rad]. They allow for rounding, encoder noise and, except in the slow memory, a velocity
+that is rounded towards zero.
 """
 
 LAG_S = 0.03
@@ -66,7 +66,7 @@ STDS = 2.0
 """Number of standard deviations by which the estimates of lag and scale error may be wrong."""
 
 BIAS_LAG_S, BIAS_SCALE, BIAS_LAG_SHARE = 0.002, 0.005, 0.1
-"""Errors that are added to the standard deviations of lag and scale error when checking for creep [s, 1], and the
+"""Used when checking for creep: errors added to the standard deviations of lag and scale error [s, 1], and the
 allowance for a lag that is not a pure delay, as a fraction of the lag times the range of velocities.
 """
 
@@ -87,8 +87,8 @@ latest three values span `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
-"""Velocity below which readings may stay the same while a joint sticks and slips, and the resolution of the
-readings [rad/s].
+"""Velocity below which the reading may stay the same while a joint sticks and slips, and resolution of the reading
+[rad/s].
 """
 
 LONGEST_GAP_S = 0.06
@@ -126,7 +126,7 @@ the measurements [rad].
 """
 
 _STEPS = np.dtype([("square", "f8"), ("age", "f8"), ("since", "f8"), ("count", "f8")])
-"""Jumps in the readings of a position.
+"""Jumps in the position readings of a joint.
 
 square: mean square of the ordinary differences [rad^2]. age: time since the start [s]. count: number of jumps in quick
 succession. since: time since the latest one [s].
@@ -135,7 +135,7 @@ succession. since: time since the latest one [s].
 _SAME = np.dtype(
     [(name, "f8") for name in ("seconds", "moved", "unknown", "since", "count", "d1", "t1", "d2", "t2", "d3", "t3")]
 )
-"""Motion since the velocity last changed.
+"""Motion since the velocity reading last changed.
 
 seconds, moved, unknown: time, change of position and its uncertainty [s, rad, rad]. since: time since values were last
 stored [s]. count: number of values stored so far. d1, t1 to d3, t3: the latest three stored values of `moved` and
@@ -162,14 +162,14 @@ MEMORY = np.dtype(
 
 position, velocity, turn: latest values, and latest change of velocity [rad, rad/s]; the position is NaN before the
 first one and after a long gap. unsure: uncertainty of the time of the latest measurement [s]. seconds, moved,
-difference, unknown: sums since the long memory was last updated; most_curved: the maximum since then. seen:
-`difference`, except for motion that is too slow for the velocity register; behind: position relative to a reference
-that follows such motion [rad]. headed: time of motion in the positive direction minus time of motion in the negative
-direction, since the same update [s]. rough: sum of squares of the errors that velocity jumps may have caused since then
-[rad^2]. heading, roughness, moving: `headed`, `rough` and the time in motion, accumulated in the slow memory [s, rad^2,
-s]. learnt: information from which lag and scale error were estimated [rad^2/s]. lag, scale: their largest accepted
-values [s, 1]. The remaining fields hold the range of the bias and the sums from which lag and scale error are
-estimated.
+difference, unknown: sums since the long memory was last updated; most_curved: largest uncertainty due to the motion
+between samples since then. seen: `difference`, except for motion that is too slow for the velocity register; behind:
+position relative to a reference that follows such motion [rad]. headed: time of motion in the positive direction minus
+time of motion in the negative direction, since that update [s]. rough: sum of squares of the errors that velocity jumps
+may have caused since then [rad^2]. heading, roughness, moving: `headed`, `rough` and the time in motion, accumulated in
+the slow memory [s, rad^2, s]. learnt: information from which lag and scale error were estimated [rad^2/s]. lag, scale:
+their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the sums from which lag and
+scale error are estimated.
 """
 
 
@@ -219,7 +219,8 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
         return True
     if not unsure > seconds and _add_to_lags(memory.lags, velocity - short.mean, short.far, short.apart, seconds):
         return True
-    # The long memories process several intervals at once, so that those of a fast rate are not lost in rounding.
+    # The long memories process several intervals at once, so that the short intervals at a high rate are not lost in
+    # rounding.
     memory.moved += moved
     memory.difference += difference
     jumped = CURVED * seconds * (velocity - before - memory.turn)
@@ -254,7 +255,7 @@ def moved_at_standstill(states: Iterable[State], joint: int, still: float) -> st
     """
     said, last, later = "", None, None
     for state in states:
-        # Over a gap, the joint may have moved at any velocity.
+        # During a gap, the joint may have moved at any velocity.
         is_gap = later is not None and later.time_before_write - state.time_before_write > LONGEST_GAP_S
         if is_gap or not abs(state.velocity[joint]) < still:
             break
@@ -323,10 +324,10 @@ def _creeps(memory: Any, velocity: float, unsure: float) -> bool:
 def _moved_at_rest(memory: Any, moved: float, seconds: float) -> float:
     """Process an interval in which the velocity reads zero; return the motion that contradicts this [rad].
 
-    A reference follows the position at a speed of up to one step of the velocity. Where this is too slow, the reference
-    jumps, so that it is never more than `STEP_RAD` away from the position. The jump is returned. Encoder noise would
-    accumulate in a sum of only the large position changes; it does not accumulate in these jumps, because it always
-    returns to its mean.
+    A reference follows the position at a speed of up to one step of the velocity register. Where this is too slow, the
+    reference jumps, so that it is never more than `STEP_RAD` away from the position. The jump is returned. Encoder
+    noise would accumulate in a sum of only the large position changes; it does not accumulate in these jumps, because
+    it always returns to its mean.
     """
     slow = RESOLUTION_RAD_S * seconds
     behind = memory.behind + moved

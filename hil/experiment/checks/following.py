@@ -9,22 +9,22 @@ standard deviation sigma, grows by
 
     [(distance from the commanded current)^2 - (distance from zero)^2] / (2 sigma^2)
 
-per sample. The step is bounded so that no single reply decides. The commanded current is any value between the last two
-goals, because a reading may be taken before or after the motor follows the latest goal, and may have a scale error of
-`GAIN_ERROR`.
+per sample. The step is bounded so that no single reply decides. Any value between the last two goals counts as the
+commanded current, because a reading may be taken before or after the motor follows the latest goal. A scale error of up
+to `GAIN_ERROR` is also accepted.
 
 Successive errors may be correlated, so each sample is weighted by the time that it represents. The unweighted sum must
 also reach h = `LEAST_RATIO`. Starting from any given check, the probability that a healthy motor's sum ever reaches h
 is at most exp(-h).
 
-While a joint stands still, its readings may also freeze when its current equals the goal, and it may take seconds
-before the goal is far from this value. But a motor's current follows its goal: if the readings of position, velocity
-and current all stay exactly the same although the goals that they may reflect (those of the last `ANSWERS_S`) have
-changed, they are frozen. A constant sensor error cancels in this comparison.
+If all readings freeze while a joint stands still and its current equals its goal, seconds may pass before the goal is
+far from the frozen value. But a motor's current follows its goal: if the readings of position, velocity and current all
+stay exactly the same although the goals that they may reflect (those of the last `ANSWERS_S`) have changed, they are
+frozen. A constant sensor error cancels in this comparison.
 
-A current sensor may be noisier than assumed. Its noise is measured at constant goals, while the arm rests before the
-start (`current_noise`), and is a lower bound on sigma: a noisy reading then means that lost torque is found later, not
-that a healthy motor is stopped.
+A current sensor may be noisier than assumed. Its noise is therefore measured at constant goals, while the arm rests
+before the start (`current_noise`), and sigma is at least as large as this noise. With a noisy sensor, lost torque is
+thus detected later, but a healthy motor is not stopped.
 
 Part of the compiled loop `joint_checks`; a record of type `MEMORY` holds a joint's state.
 """
@@ -42,7 +42,7 @@ GAIN_ERROR = 0.2
 """Largest scale error of a current sensor."""
 
 SIGMA_SHARE = 0.05
-"""Standard deviation of other errors, relative to the planned peak."""
+"""Standard deviation of errors other than the scale error, relative to the planned peak."""
 
 SIGMA_TICKS = 2.0
 """Lower bound on the standard deviation of current errors, in register ticks."""
@@ -60,16 +60,19 @@ LEAST_RATIO = 10.0
 """Log likelihood ratio at which a current counts as zero, however low the rate."""
 
 NOISY_RATIO = 16.0
-"""`LEAST_RATIO` for a sensor known to be as noisy as assumed; most sensors have far less noise than that."""
+"""Replaces `LEAST_RATIO` if the sensor's measured noise exceeds the usual assumption; most sensors have far less noise.
+"""
 
 _FEWEST = 2
-"""Minimum number of samples that differ from the goal, however low the rate."""
+"""Minimum number of successive samples that must differ from the goal before the deviation counts, however low the
+rate.
+"""
 
 ALLOWED_SIGMAS = 4.0
 """A deviation within this multiple of the measured noise is accepted."""
 
 _SOON_S = 0.1
-"""Time within which lost torque should be found [s]."""
+"""Time within which lost torque should be detected [s]."""
 
 ANSWERS_S, _BLOCKS = 0.03, 3
 """A reading may reflect any goal of the last `ANSWERS_S` [s], which are divided into `_BLOCKS` blocks."""
@@ -128,7 +131,7 @@ def allow_noise(memory: Any, goals: Any, joint: JointConfig, planned: float, fol
     noisy = ALLOWED_SIGMAS * noise
     scaled = min(GAIN_ERROR, follow_share) * planned
     memory["allowed"] = max(follow_share * planned, ALLOWED_TICKS * tick, scaled + noisy)
-    # An error in proportion to the goal makes the current change less; rounding hides up to one tick.
+    # Because of a scale error, the current may change less than the goal; rounding hides up to one tick.
     goals["most"] = (max(SIGMA_SHARE * planned, ALLOWED_TICKS * tick, noisy) + tick) / (1.0 - GAIN_ERROR)
 
 

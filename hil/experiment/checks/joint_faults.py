@@ -22,13 +22,15 @@ limit.
 """
 
 _LACKS_S, _EXPLAINED = 0.1, 0.5
-"""The supply explains missing torque if it accounts for at least `_EXPLAINED` of it within the last `_LACKS_S` [s]."""
+"""The supply explains missing torque if it accounts for at least the fraction `_EXPLAINED` of it in the last `_LACKS_S`
+[s].
+"""
 
 _FEWEST = 4
-"""Minimum number of readings from which to explain how a current differs from its goal."""
+"""Minimum number of readings needed to explain how a current differs from its goal."""
 
 Fault = tuple[Cause, str]
-"""The cause, and a sentence that omits its subject, the joint."""
+"""The cause of a fault, and a sentence about it that lacks its subject, the joint."""
 
 
 class JointFaults:
@@ -143,7 +145,7 @@ class JointFaults:
             # Published figures are too uncertain to rule out the supply, so the arm is still braked.
             return (
                 Cause.GOALS_CHANGED,
-                f"{said} at {velocity:.2f} rad/s: {self.supply[index]:.1f} V would drive the commanded current at "
+                f"{said} at {velocity:.2f} rad/s: {self.supply[index]:.1f} V can drive the commanded current at "
                 "that speed, according to the published figures. Its goals are being altered in transit or by another "
                 "program, its supply sags, a motor wire or contact is loose, or its current sensor is wrong: "
                 "check these. If all are in order, its motor is weaker than published: lower velocity_limit to "

@@ -14,7 +14,9 @@ from hil.drivers.state import State
 __all__ = ["SwappedReplies", "swapped_advice"]
 
 _NEAR = 0.25
-"""How close each servo must land to the other's former position, relative to the distance between these positions."""
+"""How close each servo's new position must be to the other's former one, relative to the distance between the former
+positions.
+"""
 
 _LEAST_TICKS = 6
 """Smallest distance between two positions [ticks] at which a swap can be distinguished from encoder noise."""
@@ -73,7 +75,7 @@ def _ticks(drive: Joint, angle: float) -> float:
 
 
 def _have_exchanged(own: _Seen, other: _Seen) -> bool:
-    """Whether each of two servos has landed at the other's former position; False if a position is NaN."""
+    """Whether each of two servos is now at the other's former position; False if a position is NaN."""
 
     def distance(first: float, second: float) -> float:
         # Within one turn, because a joint's zero may be shifted by whole turns when the bus is opened.

@@ -18,7 +18,7 @@ TOLERANCE_RAD = 0.04
 """A motor is considered reversed if the work that it has taken out of the arm, divided by the joint's largest planned
 torque, exceeds this [rad].
 
-Because of delays, a healthy motor reaches up to 0.02 rad, with a heavy arm at 20 Hz.
+Because of delays, a healthy motor may reach 0.02 rad (with a heavy arm at 20 Hz).
 """
 
 _OF_OTHERS = 0.5

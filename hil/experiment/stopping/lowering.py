@@ -33,7 +33,7 @@ from hil.plan.recent_motion import RecentMotion
 from hil.plan.way_home import PULL_PER_S, PULL_SHARE, WayHome
 
 LEAVES_RAD = 0.35
-"""Largest accepted tracking error [rad]: a joint with a larger one does not follow its path to the rest pose."""
+"""Largest accepted tracking error [rad]: if it is larger, the joint is not following its path to the rest pose."""
 
 MOST_PATHS = 4
 """Maximum number of paths to the rest pose: if the arm is pushed off the last one, lowering is abandoned."""
@@ -55,7 +55,9 @@ _FASTER = 1.3
 
 
 def may_lower(config: Config, error: BaseException) -> bool:
-    """Whether to lower the arm before torque is cut after this error: configuration and cause must both allow it."""
+    """Whether, after this error, the arm is to be lowered before torque is cut: configuration and cause must both allow
+    it.
+    """
     if not config.is_chain or config.safety.stop == "cut":
         return False
     if not isinstance(error, ExperimentError):
@@ -108,7 +110,7 @@ class Lowering:
         return bool(np.abs(self._away(state)).max() < LYING_RAD)
 
     def lies_elsewhere(self, state: State) -> str:
-        """Say which joints are not in the rest pose, and where they are instead."""
+        """Name the joints that are not in the rest pose, with their positions."""
         each = zip(self._config.joints, state.position, self._away(state), strict=True)
         found = [
             f"{joint.name!r} is at {position:.3f} rad, {away:+.2f} rad from it"
@@ -213,7 +215,7 @@ class Lowering:
             self._look_at_obedience(index, state)
 
     def _look_at_distance(self, joint: int, away: float) -> None:
-        """Check a joint that is `away` [rad] from its path; if it was pushed, ask for a new path."""
+        """Check a joint that is `away` [rad] from its path; if it was pushed, request a new path."""
         pushed = self._obedience.is_pushed(joint)
         self.needs_another_path = pushed and self._paths < MOST_PATHS
         if not self.needs_another_path:
@@ -261,7 +263,7 @@ class Lowering:
         )
 
     def others_answer(self) -> None:
-        """Record that some servos that seem silent do reply, but that a silent servo hides their replies."""
+        """Record that some servos seem silent only because a silent servo hides their replies."""
         self._guard.others_answer()
 
     def late(self, seconds: float) -> None:

@@ -15,7 +15,7 @@ LONGEST_S = 0.022
 """Reply timeout after some replies have been late [s]: longer than an adapter's latency timer of 16 ms."""
 
 LAST_S = 0.075
-"""Time after the latest reply at which waiting always ends [s]: torque must be off 25 ms later."""
+"""Waiting always ends this long after the latest reply [s]: torque must be off 25 ms later."""
 
 MARGIN_S = 0.002
 """Time between the end of an exchange and the next goals [s]."""
@@ -39,7 +39,7 @@ class Pace:
     def patience(self, unheard: float, *, are_late: bool) -> float:
         """How long the next exchange may wait for replies [s].
 
-        unheard: time since the latest reply of all servos [s]. are_late: whether recent replies were too late.
+        unheard: time since all servos last replied [s]. are_late: whether recent replies were too late.
         """
         if not are_late and not self._was_late:
             return self._usual

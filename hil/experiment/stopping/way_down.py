@@ -169,7 +169,7 @@ class WayDown:
         return state
 
     def _exchange(self, *, between: bool) -> State:
-        """Exchange the current goals and adapt the pace to the time it takes."""
+        """Exchange the latest goals with the servos, and adapt the pace to the duration of the exchange."""
         pace, former = self._pace, self._pace.every
         now = self._clock.now()
         are_late = now - self._bus.prepared.heard.late_at < _RECENT_S
@@ -195,7 +195,7 @@ class WayDown:
         self._was_silent = is_silent
 
     def _between_samples(self) -> Iterator[State]:
-        """Exchange the same goals until the next sample is due; yield each state.
+        """Repeat the exchange with the same goals until the next sample is due; yield each state.
 
         An exchange that might delay the next sample is skipped.
         """

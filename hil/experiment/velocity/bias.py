@@ -1,10 +1,10 @@
 """Bounds on the bias of a servo's velocity reading, inferred from its positions.
 
-If the velocity has a bias, for example because a register is rounded downwards, the position departs from the integral
-of the velocity in proportion to the time in motion, just as a creeping position does. But a servo's bias is constant:
-initially it may be plus or minus half a step, and every sample of a run narrows this range, since position and integral
-cannot be farther apart than bias times time plus known errors. Creep that begins later cannot widen it. If no bias in
-the range explains the distance to within twice these errors, the position creeps.
+A bias of the velocity, for example because a register is rounded downwards, makes the position depart from the integral
+of the velocity in proportion to the time in motion, as creep does. But a servo's bias is constant: initially it may be
+plus or minus half a step, and every sample of a run narrows this range, since position and integral cannot be farther
+apart than bias times time plus known errors. Creep that begins later cannot widen it. If no bias in the range explains
+the distance to within twice these errors, the position creeps.
 """
 
 from typing import Any
@@ -21,7 +21,7 @@ NOISE_RAD, NOISE_TIMES = 0.01, 3.0
 """Smallest assumed error [rad], and the assumed error as a multiple of the RMS residual."""
 
 CERTAINLY = 2.0
-"""Multiple of the errors above which a difference is a fault."""
+"""A difference is a fault if it exceeds this multiple of the errors."""
 
 FIELDS = (("least", "f8"), ("most", "f8"))
 """The range of the bias [rad/s]."""

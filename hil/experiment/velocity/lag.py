@@ -26,8 +26,8 @@ NOISE_RAD, LASTS_S = 0.0015, 0.1
 """Lower bound on the standard deviation of `apart` [rad], and correlation time of its errors [s]."""
 
 LEAST_INFORMATION = 0.1
-"""Smallest integral of the squared change of velocity, excluding what a scale error explains, at which lags are
-compared [rad^2/s].
+"""Smallest integral of the squared change of velocity, excluding the part that a scale error explains, at which lags
+are compared [rad^2/s].
 """
 
 ENOUGH_INFORMATION, ALL_INFORMATION = 0.3, 3.0
@@ -39,7 +39,7 @@ SEPARATE = 0.05
 """Fraction of the squared change of velocity that a scale error must leave unexplained to be distinct from a lag."""
 
 LONGEST_S = 0.015
-"""Longest interval between two samples over which the velocity is known well enough [s]."""
+"""Longest interval between two samples during which the velocity is known well enough [s]."""
 
 _SUMS = 10
 _LAG_2, _FAR_2, _CROSSED, _LAG_APART, _FAR_APART, _APART_2, _SECONDS, _LAG, _FAR, _APART = range(_SUMS)

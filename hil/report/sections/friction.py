@@ -78,7 +78,7 @@ def _curve(
 
 
 def model_curve(at: Array, curve: Array, low: Array, high: Array) -> tuple[tuple[Series, ...], str]:
-    """The model's friction curve with its interval, or with a sentence if the interval is narrower than the line."""
+    """The model's friction curve with its interval or, if that is narrower than the line, a sentence saying so."""
     line = Series("model", at, curve, BLUE)
     if float(np.max(high - low)) < _LINE * float(np.ptp(curve)):
         return (line,), " The 95 % interval is narrower than the line."

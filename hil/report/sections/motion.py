@@ -1,4 +1,4 @@
-"""Animation of the arm during the fitted period with the torque that moved it, then the suggested next commands."""
+"""Sections with the arm's animation during the fitted period, the torque that moved it, and suggested next commands."""
 
 import numpy as np
 from numpy.typing import NDArray

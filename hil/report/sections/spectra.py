@@ -39,7 +39,9 @@ def spectra(data: RunData) -> Section | None:
 
 
 def _levels(data: RunData) -> tuple[Table, ...]:
-    """Table of RMS motion and residual per spectral line, by kind of line; empty for older results, which lack them."""
+    """Table of RMS motion and residual per spectral line, by kind of line; empty for older results, which lack these
+    values.
+    """
     levels = data.result.validation.line_levels_ticks
     if levels is None:
         return ()

@@ -1,4 +1,4 @@
-"""Section with the verdict stored in the result: whether the model can be trusted, why, and what to do if not."""
+"""Section with the verdict stored in the result: whether the model can be trusted, why or why not, and what to do."""
 
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
 from hil.estimation.truth import truth_of

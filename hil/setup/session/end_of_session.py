@@ -33,7 +33,7 @@ def end_with(bus: ServoBus, stopped: BaseException | None, left: Sequence[str], 
             _retract(stopped, _NEVER_ON if before is None else str(before))
             instead.last_samples = getattr(stopped, "last_samples", None)
     if ended := instead or stopped:
-        for line in left:  # after what stopped the arm and the state of its torque, which matter more
+        for line in left:  # last, because what stopped the arm and whether its torque is off matter more
             ended.add_note(line)
     elif left:
         raise ExperimentError(" ".join(left))

@@ -29,8 +29,8 @@ def left_behind(port: str, joint: Joint) -> Kept | None:
 class Left:
     """Settings that a killed program left on one servo.
 
-    kept: the settings before that program. changed: the registers that another program has changed since then, each
-    with its present value. wanted: the settings to restore; the changed registers keep their present values.
+    kept: the settings from before that program ran. changed: the registers that another program has changed since then,
+    each with its present value. wanted: the settings to restore; the changed registers keep their present values.
     differing: the registers to restore, each with its present value and the value to restore.
     """
 

@@ -27,8 +27,8 @@ _USUAL_BAUD = 1_000_000
 class Leftovers:
     """What a killed run left on one servo.
 
-    told: sentences about the run, what differs and the file with the former settings. restore: the command that
-    restores the servo; "" if none can. trouble: a short description of the problem.
+    told: sentences that name the run, the settings that differ, and the file with the former settings. restore: the
+    command that restores the servo; "" if none can. trouble: a short description of the problem.
     """
 
     told: str

@@ -14,7 +14,7 @@ from hil.setup.session.killed_run import Left, is_left_on, left_behind, what_is_
 from hil.setup.session.settings_file import Kept
 
 _REST_S = 0.05
-"""Time between finding that settings differ and restoring them again [s]."""
+"""Delay between finding that settings differ and restoring them again [s]."""
 
 _MOST_CHECKS = 3
 """Maximum number of times that the settings of all servos are read again after being restored."""
@@ -151,7 +151,7 @@ class SavedSettings:
         name, now, wanted = found
         return WrongSetting(
             f"{joint.title}: {name} reads {now} after {wanted} was restored and read back: another program writes to "
-            "it, or replies are late. End that program."
+            "it, or replies are late. Stop that program."
         )
 
     def _check_model(self, servo: Servo) -> None:

@@ -1,7 +1,7 @@
 """A session with the arm's servos: their settings are saved before the first write and restored after the last.
 
 A session holds the port. A session inside another one for the same arm shares the port, so that the steps of a pilot
-write each EEPROM register only once. Each register is also restored only once, when the outermost block is left for
+write each EEPROM register only once. Each register is also restored only once, when the outermost block ends, for
 whatever reason. If a killed program left saved settings behind, these are taken as the servos' original settings and
 restored at the end (`killed_run`).
 """
@@ -49,7 +49,7 @@ REBOOT_S = 0.6
 """A servo that does not answer at the end may be booting; it is tried again after this time [s]."""
 
 COUNT_DOWN_S = 5.0
-"""After a stopped run, time [s] between the warning that the arm will move again and torque being switched on."""
+"""Time from the warning that the arm will move again, after a stopped run, until torque is switched on [s]."""
 
 
 def to_stderr(text: str) -> None:
@@ -72,9 +72,10 @@ class ServoSession:
     _delays: dict[Joint, int] = field(default_factory=dict)
     """Return Delay Time of each servo at the beginning [2 us]."""
     _is_ours: bool = False
-    """Whether the servos are the arm's and no other program holds them, so that they may be written to."""
+    """Whether the servos belong to the arm and no other program holds them, so that they may be written to."""
     _on_again: dict[Joint, int] = field(default_factory=dict)
-    """Servos whose torque another program has switched on since it was cut, and the number of times it was cut again.
+    """Servos whose torque another program has switched on since it was cut, with the number of times that it was cut
+    again.
     """
     _torque: dict[Joint, bool | None] = field(default_factory=dict)
     """Whether each servo's torque was on at the latest reading; None if unknown (`ServoBus.torque_now`)."""
@@ -105,7 +106,7 @@ class ServoSession:
         for joint, servo in bus.drives.items():
             settings = read_settings(servo)
             self._delays[joint] = servo.read("Return Delay Time")
-            # If this program is killed, the next one can tell that another has changed what protects the servo.
+            # If this program is killed, the next one can thus tell whether another has changed a protective setting.
             changed = {name: settings[name] for name in PROTECTIVE if name in settings}
             changed["Operating Mode"] = int(joint.mode)
             if joint.mode is Mode.CURRENT:
@@ -167,7 +168,8 @@ class ServoSession:
     def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
         """Cut torque where it is on and restore these servos' settings; return whether there was anything to do.
 
-        If torque has been switched on again before, watch it for WATCH_S: a single reading may come too early.
+        If torque has been switched on again before, it is watched for WATCH_S, because a single reading may come too
+        early.
 
         failed: receives the errors of the servos whose settings could not be restored.
         """
@@ -200,7 +202,7 @@ class ServoSession:
         if off := [joint for joint in self._on_again if joint not in {*on, *silent}]:
             yield (
                 f"Another program switched torque on at {and_list(map(str, off))} before or while the settings were "
-                "restored. It was cut again and was still off when it was last read. End that program before "
+                "restored. It was cut again and was still off when it was last read. Stop that program before "
                 "you reach into the arm's workspace: it may switch torque on again."
             )
 
@@ -267,7 +269,7 @@ def _end(session: ServoSession, stopped: BaseException | None) -> None:
             left = session.end()
             if bus.port.strangers and not isinstance(stopped, BusShared):
                 left.append(
-                    "Another program sent packets on this bus while the servos were being set up or restored. End it "
+                    "Another program sent packets on this bus while the servos were being set up or restored. Stop it "
                     "before you start hil again: it may move the arm."
                 )
     except BaseException as signalled:

@@ -57,7 +57,7 @@ class Kept:
 
     @property
     def may_restore(self) -> bool:
-        """Whether this process may restore the settings: the program that saved them has ended, or is this one."""
+        """Whether this process may restore the settings: the program that saved them has ended, or is this process."""
         if self.program == os.getpid():
             return True
         try:
@@ -102,7 +102,7 @@ def keep(
 ) -> Kept:
     """Write the file of a servo; it is on disk when this function returns. Raises RunFolderError.
 
-    A file of the same servo under another name of the port is removed afterwards.
+    If a file of the same servo exists under another name of the port, it is removed afterwards.
 
     since: when these settings were first saved; by default, now. config: absolute path of the configuration.
     """
@@ -193,7 +193,7 @@ def forget(kept: Kept) -> str:
 def write_durably(path: Path, value: object) -> None:
     """Write a JSON file completely and flush it to disk. Raises RunFolderError.
 
-    Another thread may write the file too, and another program may remove its folder.
+    Another thread may be writing the same file, and another program may remove its folder.
     """
     try:
         try:

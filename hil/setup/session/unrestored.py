@@ -115,8 +115,8 @@ def _lowered_limits(saved: SavedSettings, settings: Settings, silent: Collection
 
 
 def _changed_meaning(saved: SavedSettings, settings: Settings, silent: Collection[Joint]) -> Iterator[str]:
-    """Report changes to settings that determine the meaning of angles or goals: the next start accepts them as they
-    are.
+    """Report changes to settings that determine what angles or goals mean, since the next start accepts these settings
+    as they are.
     """
     for joint, servo in saved.bus.drives.items():
         for name in (_OFFSET, _DRIVE_MODE):

@@ -151,7 +151,7 @@ def test_setup_still_refuses_torque_that_no_run_left(
     torque_on(bench, 1, 0)
     bench.servos[1].trip_watchdog()
     assert hil("setup", config.url, "--id", 1, "--new-id", 7, "--yes") == 2
-    assert "A program that has ended left it on, and the servo's watchdog has tripped" in capsys.readouterr().err
+    assert "A program left it on when it ended, and the servo's watchdog has tripped" in capsys.readouterr().err
     assert bench.servos[1].torque_enabled
 
 

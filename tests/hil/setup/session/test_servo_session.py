@@ -492,7 +492,7 @@ def test_a_goal_that_another_program_keeps_writing_is_named_with_its_value(
         return failed
 
     monkeypatch.setattr(SavedSettings, "put_back", put_back)
-    said = r"'elbow'.*Goal Current reads -36 after 1193 was restored .*another program writes to it.* End that program"
+    said = r"'elbow'.*Goal Current reads -36 after 1193 was restored .*another program writes to it.* Stop that program"
     with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
         pass
 
