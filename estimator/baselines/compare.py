@@ -27,7 +27,7 @@ from hil.estimator.selection.prediction import prediction_rms
 CUTOFFS = (6.0, 10.0, 15.0, 25.0, 40.0)  # Hz
 WIDTHS = (0.007, 0.02, 0.05, 0.15)  # rad/s
 VELOCITY_NOISES = (1e-4, 1e-3, 1e-2, 1e-1)  # rad/s per sqrt(s)
-SHORT = 0.5  # s of simulation over which settings are compared
+SHORT = 0.5  # s; length of the simulations by which settings are compared
 PERIODS = 3  # repetitions of the settled period joined end to end for the filters, which need time to converge
 
 Fit = InverseDynamics | Filtered

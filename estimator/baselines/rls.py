@@ -51,7 +51,8 @@ def _causal_rows(recording: Recording, cutoff: float, width: float, delay: float
     tau, _ = sosfilt(filter_, torque, axis=1, zi=rest * torque[None, :, :1])
     velocity = np.diff(smooth, axis=1) / dt
     acceleration = np.diff(velocity, axis=1) / dt
-    # A difference belongs to the middle of its interval: one sample back for the second derivative, half for the first.
+    # A difference belongs to the middle of its interval: one sample back for the second derivative, half a sample for
+    # the first.
     velocity = 0.5 * (velocity[:, 1:] + velocity[:, :-1])
     Y = regressor(smooth[:, 1:-1], velocity, acceleration, width)
     start = sosfilt_zi(filter_)[:, None, :, None]

@@ -13,7 +13,7 @@ SIGNAL_OVER_NOISE = 4.0  # power ratio above which a band of lines counts as sig
 BAND = 8  # lines that are evaluated together
 
 
-_DRAWS = 16  # of interpolated white noise, for a standard deviation accurate to about 1 %
+_DRAWS = 16  # draws of interpolated white noise, for a standard deviation accurate to about 1 %
 _AHEAD = np.array((3.0, -3.0, 1.0))
 """Weights of the three nearest samples, nearest first, for quadratic extrapolation by one sample."""
 
@@ -91,7 +91,7 @@ def _interpolated_noise(valid: Mask) -> float:
 
 
 def interpolated_noise(valid: Mask) -> Array:
-    """Return white noise of standard deviation 1 (draws, samples), with samples that are not `valid` interpolated."""
+    """Return white noise of standard deviation 1 (draws, samples), interpolated wherever samples are not `valid`."""
     index = np.arange(valid.size)
     drawn = np.random.default_rng(_DRAWS).standard_normal((_DRAWS, valid.size))
     drawn[:, ~valid] = [np.interp(index[~valid], index[valid], row[valid]) for row in drawn]

@@ -12,7 +12,7 @@ from hil.estimator.simulation.arm import steps_per_sample
 from hil.estimator.simulation.closed_loop import Feedback
 
 PERIODS = 3  # number of periods simulated, of which the last is used
-FINER = 4  # smaller integration steps that replace one near standstill
+FINER = 4  # number of smaller integration steps that replace one step near standstill
 NEVER = 1e6  # N m: a torque limit that is never reached
 
 
@@ -26,7 +26,8 @@ def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeri
     excitation, feedback = _commands(period)
     steps = steps_per_sample(period.rate)
     step = 1.0 / (period.rate * steps)
-    # Commands take effect `command_to_sample` before the sample of their index, plus `delay`; lumped into a lag.
+    # A command takes effect `command_to_sample` before the sample with its index, plus `delay`; all are lumped into a
+    # lag.
     late = lags_of(parameters, joints) + parameters.get("delay", 0.0) - period.command_to_sample
     lag = np.maximum(late, 1e-5)
     fallen = 1.0 - np.exp(-step / lag)
