@@ -22,9 +22,9 @@ from hil.estimator.fit.normal_equations import normal_equations
 from hil.estimator.options import CovarianceOptions
 
 DEFAULTS = CovarianceOptions()
-FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates stay finite
-SENSITIVE = 1e7  # largest change in a sample, in units of the noise, per unit of a coordinate (RMS)
-LEAST_INFORMATION = 1e-13  # for a combination of coordinates, relative to each alone; anything less is rounding error
+FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates have finite variances
+SENSITIVE = 1e7  # largest RMS change of the samples, in units of the noise, per unit change of a coordinate
+LEAST_INFORMATION = 1e-13  # information about a combination of coordinates, relative to each alone; less is rounding error
 VANISHED = 1e-3  # ratio of slope to value below which a parameter has run into its floor
 
 

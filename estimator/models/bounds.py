@@ -16,7 +16,7 @@ from hil.estimator.models.terms import kind_of, term_of
 
 SURE = 3.0  # standard errors by which the best value must lie outside the range
 NEAR = 0.1  # distance from the bound, relative to the step beyond it, within which a fit counts as at the bound
-FAINTEST = 1e-140  # influence of a coordinate below which its square underflows
+FAINTEST = 1e-140  # the square of any smaller influence of a coordinate underflows
 MOVED = 1.0  # standard errors by which the bound must shift another parameter for that parameter to count as affected
 
 

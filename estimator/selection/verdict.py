@@ -21,16 +21,16 @@ from hil.estimator.selection.drift import LEAST, Drift, TorqueChange
 from hil.estimator.selection.validation import Validation
 
 EXPLAINED = 1.06  # ratio of residual to noise up to which the model explains the motion
-GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # prediction error relative to the motion's RMS
+GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # largest prediction error, relative to the motion's RMS
 LEAST_PERCENT = 0.01  # smallest prediction error that is reported; smaller ones are lost in the noise
 MUCH_LEFT = 5.0  # ratio of residual to noise above which parameters are doubtful without a held-out check
-WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
+WELL_KNOWN, WEAK = 0.02, 0.1  # limits on relative standard errors
 UNDETERMINED = 10.0  # ratio of standard error to value above which a parameter is not determined at all
 LITTLE_EFFECT = 0.02  # standard error of a parameter's torque, relative to the joint's, below which it hardly matters
 ALIKE = 0.99  # correlation above which two parameters are hard to separate
 NOTICEABLE = 0.005  # fraction of the residual that a term must explain to be mentioned
 NOISY = 1.25  # ratio of noise to rounding above which the noise is mentioned
-WARM_UP_TIMES, WARM_UP_ROUNDING = 4.0, 30.0  # relative to the time over which a change was observed; s
+WARM_UP_TIMES, WARM_UP_ROUNDING = 4.0, 30.0  # multiple of the time in which a change was seen; rounded to [s]
 IMPROVEMENT = {
     "inertia": "faster motion: raise the upper edge of experiment.band or {torque}",
     "coupling": "faster motion of both joints together: raise {torque}",

@@ -441,8 +441,8 @@ def _loop(
 
 
 # Only the loop is called from Python; wrappers for the others would take another second to compile. Calls that are not
-# inlined would spend more time on counting references to arrays than on arithmetic. None of this allocates, and code
-# without such counts is compiled a fifth faster.
+# inlined would spend more time on counting references to arrays than on arithmetic. None of these functions allocates
+# memory, so they do without such counts; this also makes compilation a fifth faster.
 fused = partial(embedded, fastmath={"contract"}, forceinline=True, _nrt=False)
 _drive, _arm, arm_step, follow = map(fused, (_drive, _arm, arm_step, follow))
 _advance: Callable[..., None] = compiled(_loop, fastmath={"contract"}, _nrt=False)

@@ -91,7 +91,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Pull:
-    """Torque that grows while a joint is off its path, so that friction and unknown weights cannot hold it off the path.
+    """Torque that grows while a joint is off its path, so that friction and unknown weights cannot keep it off.
 
     path: positions (samples, joints) [rad]. per_second: growth relative to the spring's torque [1/s]. share: maximum of
     this torque, as a fraction of the joint's largest torque.
