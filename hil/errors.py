@@ -47,7 +47,8 @@ __all__ = [
 
 
 class Cause(Enum):
-    """What the guard detected. If the measurements and the drive still work, the arm can be braked first."""
+    """What the guard detected. It decides whether the arm can be braked or lowered before its torque is switched off.
+    """
 
     POSITION = "position limit"
     VELOCITY = "velocity limit"

@@ -1,8 +1,8 @@
 """Comparison of other methods, each tuned and timed, on the same settled period.
 
-All methods receive the same positions and commands. Their torque is the command with the delay that hil estimated in
-stage 1, so that none of them has to estimate the delay. Each method is tuned by trying several settings and keeping
-those whose simulation is closest to the recording; only the run time with these settings is reported.
+All methods receive the same positions and commands. The commands are delayed by the value that hil estimated in stage
+1, so that no other method has to estimate the delay. Each method is tuned by trying several settings and keeping those
+whose simulation is closest to the recording; only the run time with these settings is reported.
 """
 
 import time

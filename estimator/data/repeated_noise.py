@@ -26,7 +26,7 @@ from hil.estimator.data.fourier import interpolated_noise, slow_part, white_nois
 
 __all__ = ["agreed_noise", "coloured_noise", "repeated_noise"]
 
-FEWEST = 20  # samples of a pass; at 20 Hz, half a period of 2 s
+FEWEST = 20  # minimum number of samples in a pass; at 20 Hz, half a period of 2 s
 ROUNDING = 1.0 / 12.0  # steps^2
 AGREE = 2.0  # standard errors
 _LINES = 8.0  # a period's noise is measured from one line per this many samples

@@ -55,7 +55,7 @@ class Scatter:
 
 
 def correlation_time(residuals: Sequence[Array], options: CovarianceOptions = DEFAULTS) -> int:
-    """Return twice the lag [samples] beyond which no residual (joints, samples) of any run is correlated.
+    """Return twice the lag [samples] beyond which no residual (joints, samples) of any run is autocorrelated.
 
     That lag is the first at which the autocorrelation falls into the range expected of white noise.
     """
@@ -102,7 +102,7 @@ def robust_covariance(
     structured: float = 0.0,
     expected: Array | None = None,
 ) -> Array:
-    """Return the covariance of the first `count` coordinates (count, count) if all coordinates are unknown.
+    """Return the covariance of the first `count` coordinates (count, count), treating all coordinates as unknown.
 
     In every direction, it is the larger of the sandwich and the covariance for independent errors, since a short
     recording cannot prove that its errors cancel. It is infinite for a coordinate without influence on the residual.

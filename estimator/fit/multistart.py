@@ -88,7 +88,9 @@ class Search:
         return self._undisguised(refined, replace(minimum, iterations=spent))
 
     def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
-        """Replace constant Stribeck rises with Coulomb friction, unless the fit becomes significantly worse."""
+        """Replace Stribeck rises that hardly fall in this motion with Coulomb friction, unless the fit becomes much
+        worse.
+        """
         if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
             return refined, minimum
         try:

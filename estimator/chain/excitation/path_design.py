@@ -25,7 +25,7 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.errors import ExcitationError
 from hil.estimator.progress import Tell, counted
 
-LOOKED_AT = 120  # samples at which a variation is evaluated
+LOOKED_AT = 120  # number of samples at which a variation is evaluated
 NOISE = 0.02  # assumed residual of a regression, relative to a joint's RMS torque, friction included
 SLOW = 0.1  # rad/s: width of the smoothed Coulomb step
 CENTRES = 48

@@ -32,7 +32,7 @@ JOINT_TERMS = (
     *("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
     *("torque_scale", "zero"),
 )
-NEAR = 6.0  # distance from standstill within which steps may be divided, in widths of friction's step
+NEAR = 6.0  # distance from standstill within which steps may be divided, in widths of the Coulomb step
 CROSSED = 1.0  # number of these widths that a joint may cross in one step
 WORST = 1e4  # rad or rad/s: a simulation that reaches this has diverged
 
