@@ -47,8 +47,7 @@ __all__ = [
 
 
 class Cause(Enum):
-    """What the guard detected. It decides whether the arm can be braked or lowered before its torque is switched off.
-    """
+    """What the guard detected, which decides whether the arm can be braked or lowered before its torque is cut."""
 
     POSITION = "position limit"
     VELOCITY = "velocity limit"

@@ -20,7 +20,7 @@ from hil.estimator.models.terms import extra_names
 from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
 from hil.estimator.threads import thread_count
 
-KNOTS = 4  # knots of each joint's amplitude spectrum, over the logarithm of the line number
+KNOTS = 4  # number of knots of each joint's amplitude spectrum, over the logarithm of the line number
 SHAPE_TRIALS = 60
 PHASE_TRIALS = 60
 DIFFERENCE = 1e-3  # finite difference: relative for a parameter, absolute for the state [rad, rad/s]

@@ -24,7 +24,7 @@ from hil.estimator.options import CovarianceOptions
 DEFAULTS = CovarianceOptions()
 FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates have finite variances
 SENSITIVE = 1e7  # largest RMS change of the samples, in units of the noise, per unit change of a coordinate
-LEAST_INFORMATION = 1e-13  # information about a combination of coordinates, relative to each alone; less is rounding error
+LEAST_INFORMATION = 1e-13  # information on a combination of coordinates, relative to each alone; less is rounding error
 VANISHED = 1e-3  # ratio of slope to value below which a parameter has run into its floor
 
 

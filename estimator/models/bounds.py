@@ -88,7 +88,7 @@ def bound_sentence(names: Sequence[str]) -> str:
     late = any(kind_of(name) == "back_emf" for name in names)
     cause = (
         "The lagging back-EMF already cancels as much of the joint's inertia as is physically possible, so the inertia "
-        "and the lag may be wrong: check the joint's mode and servo model, and what else may delay its torque"
+        "and the lag may be wrong: check the joint's mode and servo model, and whether anything else delays its torque"
         if late
         else "This is due to an effect missing from the model or to too little motion, and it distorts other values: "
         "use wider and faster motion, and look for a cause among the findings above"

@@ -271,9 +271,10 @@ def _pushed(torque: TorqueChange | None) -> tuple[str, ...]:
         if seen
     )
     return (
-        f"Relative to the fitted motion, a constant torque of {found} acts in the held-out one. It explains the "
-        "difference better than a change in friction does. In one of the two motions, something pushed or pulled the "
-        "arm, a cable tightened, the arm carried something, or its base tilted. Remove the cause and record again.",
+        f"Compared with the fitted motion, an additional constant torque of {found} acts in the held-out one. It "
+        "explains the difference better than a change in friction does. In one of the two motions, something pushed or "
+        "pulled the arm, a cable tightened, the arm carried something, or its base tilted. Remove the cause and record "
+        "again.",
     )
 
 

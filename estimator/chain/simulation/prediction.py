@@ -19,8 +19,8 @@ NEVER = 1e6  # N m: a torque limit that is never reached
 def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeriod) -> Array:
     """Predict the joint angles (joints, samples) [rad] of a settled period under its commands and its feedback.
 
-    The simulation starts at rest at the first measured position and continues until the transient has decayed. Raises
-    PeriodicityError if the motion diverges.
+    The simulation starts at rest at the first measured position and lasts for PERIODS periods, so that the transient
+    decays. Raises PeriodicityError if the motion diverges.
     """
     joints, samples = period.joints, period.samples
     excitation, feedback = _commands(period)

@@ -145,7 +145,7 @@ def _other(name: str, goal: Array, measured: Array, margin: float) -> str:
     if part > OFTEN and _follows_small_goals(goal, measured) < SHORT:
         return (
             f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
-            f"high-torque samples, and equally little at low torque, where nothing clips it: {why}"
+            f"high-torque samples, and just as little at low torque, where nothing clips it: {why}"
         )
     return ""
 
