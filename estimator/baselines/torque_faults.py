@@ -23,7 +23,7 @@ BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
 OUTERMOST = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4])
 """Angles at which to try a mechanical stop, each given as the fraction of samples beyond it."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays to try, in sampling intervals
-DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # changes in delay to try, likewise
+DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # total drifts to try, likewise
 LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
 FEWEST_STEPS = 2  # least difference between the best delays of two joints, in sampling intervals
 UNEVEN = 0.85  # largest ratio of a joint's residual at its own best delay to that at the other joint's best delay

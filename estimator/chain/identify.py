@@ -40,7 +40,7 @@ SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005
 less than the usual error of a manually adjusted zero.
 """
 
-BELIEVED = 0.5  # a value is the prior's if its standard error under white noise exceeds this fraction of the prior's
+BELIEVED = 0.5  # largest standard error under white noise, relative to the prior's, of a value that the data determine
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def _changes(
 
 
 def _load(joints: int) -> tuple[Direction, ...]:
-    """Return the effects of a mass anywhere on the last link; its first moment changes gravity_2 and coupling alike."""
+    """Return the effects of a mass on the last link; its first moment scales gravity_2 and coupling by one factor."""
     if joints == 1:
         return ({"inertia_1": 1.0}, {"gravity_1": 1.0})
     return ({"inertia_1": 1.0}, {"gravity_1": 1.0}, {"gravity_2": 1.0, "coupling": 1.0}, {"inertia_2": 1.0})

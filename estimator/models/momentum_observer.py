@@ -51,7 +51,7 @@ NAMES = (
     *("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
     *("viscous_1", "viscous_2", "coulomb_1", "coulomb_2", "offset_1", "offset_2", "tilt_1", "tilt_2"),
 )
-"""Names of the parameters. The tilts multiply the sines of the angles, as gravity does if the base is tilted."""
+"""Names of the parameters. The tilts are gravity torques that follow the sines of the angles, due to a tilted base."""
 
 FILTER_S = 0.02
 HOLD_S = 0.05

@@ -343,12 +343,13 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
         share = 100 * validation.torque_std[name]
         if part > 1.0:
             return (
-                f"{name} cannot be distinguished from zero. It hardly affects this arm: its standard error is "
-                f"{share:.2g} % of the fitted motion's torque.",
+                f"{name} cannot be distinguished from zero. It hardly affects this arm: its standard error "
+                f"amounts to {share:.2g} % of the fitted motion's torque.",
             )
         return (
             f"The least certain parameter is {name}, known to within {percent(part)}. It hardly affects this arm: "
-            f"its standard error is {share:.2g} % of the fitted motion's torque. To improve it, use {improvement}.",
+            f"its standard error amounts to {share:.2g} % of the fitted motion's torque. To improve it, use "
+            f"{improvement}.",
         )
     if part >= UNDETERMINED:
         return (f"This motion does not determine {name}. To identify it, use {improvement}.",)

@@ -305,7 +305,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
         return f"{said} nothing remains unexplained."
     causes = (
         "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time, joints "
-        "whose position or axis differs from the description or whose direction is wrong (direction)"
+        "whose position or axis differs from the description, or whose key `direction` is wrong"
     )
     if not estimate.model.base_tilt and np.any(estimate.model.base.chain.gravity):
         causes = f"a base that is not level ([model] base_tilt = true identifies it), {causes}"

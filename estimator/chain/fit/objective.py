@@ -70,7 +70,7 @@ class ChainProblem:
     only if `steps` is 1.
     """
     reach: float = 1.0
-    """Fraction of their maximum change per step that friction-shape parameters may use; smaller near the minimum."""
+    """Fraction of the maximum change per step that friction-shape parameters may use; smaller near the minimum."""
     prior_weight: float = 1.0
     """Factor on the prior's precision. It exceeds 1 while model errors exceed the noise that the weights assume, so
     that the prior still decides what the data do not determine.

@@ -46,7 +46,7 @@ class ChainOptions:
     min_initial_lag: float = 5e-4
     """Minimum initial guess of the lag [s]."""
     reach: float = 0.3
-    """Fraction of their maximum change per step that friction-shape parameters may use in the last iterations.
+    """Fraction of the maximum change per step that friction-shape parameters may use in the last iterations.
 
     The sum of squares is far from quadratic in these parameters.
     """

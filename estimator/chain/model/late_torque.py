@@ -153,7 +153,7 @@ def _most_lost(
     largest, parts = 0.0, np.zeros_like(lost)
     for pose in _POSES[:, : base.chain.joints]:
         mass = mass_matrix(base.chain, every, pose)
-        if np.all(np.isfinite(mass)) and linalg.eigvalsh(mass)[0] > 0.0:  # otherwise it cannot be simulated anyway
+        if np.all(np.isfinite(mass)) and linalg.eigvalsh(mass)[0] > 0.0:  # other arms cannot be simulated anyway
             fractions, motions = linalg.eigh(root[:, None] * linalg.inv(mass) * root)
             if fractions[-1] > largest:
                 largest, parts = float(fractions[-1]), np.square(motions[:, -1])

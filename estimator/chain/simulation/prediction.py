@@ -26,8 +26,8 @@ def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeri
     excitation, feedback = _commands(period)
     steps = steps_per_sample(period.rate)
     step = 1.0 / (period.rate * steps)
-    # A command takes effect `command_to_sample` before the sample with its index, plus `delay`; all are lumped into a
-    # lag.
+    # The delay is lumped into the lag, less `command_to_sample`, by which commands act before the samples of the same
+    # index.
     late = lags_of(parameters, joints) + parameters.get("delay", 0.0) - period.command_to_sample
     lag = np.maximum(late, 1e-5)
     fallen = 1.0 - np.exp(-step / lag)
