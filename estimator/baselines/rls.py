@@ -16,7 +16,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.models.regressor import regressor
 from hil.estimator.models.terms import base_names
 
-ORDER = 4  # of the filter
+ORDER = 4  # order of the filter
 WIDE = 1e3  # standard deviation of the parameters before the first sample, in SI units
 WARM_UP = 2.0  # cycles of the cut-off frequency until the filters' initial transients have decayed
 

@@ -24,11 +24,11 @@ OUTERMOST = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4])
 """Angles at which to try a mechanical stop, each given as the fraction of samples beyond it."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays to try, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # total drifts to try, likewise
-LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
+LATEST = 0.06  # s; largest delay to try between the torque of one joint and those of the others
 FEWEST_STEPS = 2  # least difference between the best delays of two joints, in sampling intervals
 UNEVEN = 0.85  # largest ratio of a joint's residual at its own best delay to that at the other joint's best delay
 EXPLAINED = 0.3  # relative residual of each joint at its best delay, above which the torque does not fit at all
-EVALUATIONS = 30  # of the search for delay and drift
+EVALUATIONS = 30  # maximum number in the search for delay and drift
 MOST_SAMPLES = 30_000  # more would take too long
 
 

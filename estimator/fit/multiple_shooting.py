@@ -36,7 +36,7 @@ DEFAULTS = ShootingOptions()
 ALL = slice(None)
 MOST_WEIGHT = 1e9
 ENOUGH = 1.25  # minimum number of samples in a short segment, relative to FEWEST
-MOST_SHORT = 0.6  # of a segment's length; short segments that would have to be longer are not tried
+MOST_SHORT = 0.6  # short segments are not tried if they had to be longer than this fraction of a segment
 
 
 @dataclass(frozen=True)

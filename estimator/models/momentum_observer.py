@@ -486,7 +486,7 @@ def _observe_loop(
     return alarm
 
 
-_inner = partial(embedded, _nrt=False)  # none of them allocates memory
+_inner = partial(embedded, _nrt=False)  # none of these functions allocates memory
 _regressors, _begin_anew, _filter = map(_inner, (_regressors, _begin_anew, _filter))
 _gain, _lacks, _learn = map(_inner, (_gain, _lacks, _learn))
 _keep_dissipative = _inner(_keep_dissipative)

@@ -25,7 +25,7 @@ from hil.estimator.options import MinimiserOptions
 from hil.estimator.simulation.drive import torque_and_slopes
 
 MINIMISER = MinimiserOptions()
-MOST_KEPT = 1 << 26  # bytes of derivatives
+MOST_KEPT = 1 << 26  # maximum size of the stored derivatives [bytes]
 
 
 @dataclass

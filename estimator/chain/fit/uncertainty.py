@@ -24,7 +24,7 @@ from hil.estimator.chain.fit.resolved_widths import free_inertias
 from hil.estimator.chain.model.late_torque import lost_inertia, rotor
 from hil.estimator.simulation.back_emf import neglected_inertia
 
-MOST_SAMPLES = 1 << 13  # of a period; enough to estimate a noise level to within 10 %
+MOST_SAMPLES = 1 << 13  # number of a period's samples to use; enough to estimate a noise level to within 10 %
 SUPPOSED = 10.0  # degrees of freedom of the white level in the common level, and of the common level in each joint's
 
 

@@ -23,7 +23,7 @@ motion.
 """
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
-_ARMATURE = 10  # of a link's parameters
+_ARMATURE = 10  # index among a link's parameters
 _POSES = np.random.default_rng(4).uniform(-np.pi, np.pi, (6, 7))  # poses in which inertias are compared (poses, joints)
 
 

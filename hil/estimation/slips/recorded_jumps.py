@@ -14,7 +14,7 @@ from hil.estimator import linalg
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import Recording
 
-SIDE = 5  # samples on either side of an interval
+SIDE = 5  # number of samples on either side of an interval
 ORDER = 3  # order of the polynomial that describes a smooth motion over these samples
 LEAST_NOISES = 20.0  # standard deviations of the noise; about six encoder steps if the noise is due to rounding
 FEWEST = 200  # samples
