@@ -168,7 +168,7 @@ class _TwoRuns:
         self._state_scale = np.repeat([options.angle_scale, velocity], periods[0].joints)
 
     def start(self) -> Array:
-        """Return the initial guess: the first run's estimate, and the second period's measured initial state."""
+        """Return the initial guess: the first period's estimate, and the second period's measured initial state."""
         joints, rate = self.periods[0].joints, self.periods[1].rate
         filled = self.periods[1].filled()
         value = self._first.value.copy()

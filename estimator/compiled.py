@@ -18,8 +18,8 @@ PACKAGE = __name__.split(".", maxsplit=1)[0]
 def compiled(function: Callable[..., Any], **options: Any) -> Any:
     """Compile `function` to run without the GIL, cached on disk until any code or constant that it contains changes."""
     dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
-    # numba has no public name for this; without it the cache would only check the date of one file, as numba's own
-    # cache does.
+    # These attributes of numba are not public. Without this, the cache would only check the date of one file, as
+    # numba's own cache does.
     on_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if on_file is not None:
         on_file._source_stamp = code_digest(dispatcher)

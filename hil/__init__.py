@@ -76,8 +76,8 @@ logging.getLogger("hil").addHandler(logging.NullHandler())
 def load_model(path: str | PathLike[str]) -> ArmModel:
     """Read the identified arm from a run folder, its result.json, or a TOML or JSON file written by `hil export`.
 
-    Requires only numpy. Raises hil.errors.ResultError, whose message names the file and says whether it is missing,
-    incomplete, damaged, or from a newer version of hil.
+    Requires only numpy. Raises hil.errors.ResultError; its message names the file and says whether it is missing,
+    incomplete, damaged, or written by a newer version of hil.
     """
     from hil.model_file import read_model
 

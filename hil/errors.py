@@ -47,7 +47,7 @@ __all__ = [
 
 
 class Cause(Enum):
-    """What the guard detected. If the measurements and the drive still work, the arm can be braked first."""
+    """What the guard detected, which decides whether the arm can be braked or lowered before its torque is cut."""
 
     POSITION = "position limit"
     VELOCITY = "velocity limit"

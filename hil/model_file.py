@@ -1,4 +1,4 @@
-"""Reads an `ArmModel` from a run folder, result.json or exported TOML/JSON. Standard library and numpy only."""
+"""Read an `ArmModel` from a run folder, result.json or exported TOML/JSON. Standard library and numpy only."""
 
 import json
 import math
@@ -171,7 +171,7 @@ def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
         raise ResultError(f"{path} is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
     if unknown:
         raise ResultError(
-            f"{path} has {', '.join(unknown)}, which this version of hil does not know; the file is from a newer one."
+            f"{path} has {', '.join(unknown)}, which this version of hil does not know; a newer version wrote the file."
         )
     bad = [name for name, value in values.items() if not math.isfinite(value)]
     if bad:

@@ -1,8 +1,8 @@
 """Comparison of other methods, each tuned and timed, on the same settled period.
 
-All methods receive the same positions and commands. Their torque is the command with the delay that hil estimated in
-stage 1, so that none of them has to estimate the delay. Each method is tuned by trying several settings and keeping
-those whose simulation is closest to the recording; only the run time with these settings is reported.
+All methods receive the same positions and commands. The commands are delayed by the value that hil estimated in stage
+1, so that no other method has to estimate the delay. Each method is tuned by trying several settings and keeping those
+whose simulation is closest to the recording; only the run time with these settings is reported.
 """
 
 import time
@@ -27,7 +27,7 @@ from hil.estimator.selection.prediction import prediction_rms
 CUTOFFS = (6.0, 10.0, 15.0, 25.0, 40.0)  # Hz
 WIDTHS = (0.007, 0.02, 0.05, 0.15)  # rad/s
 VELOCITY_NOISES = (1e-4, 1e-3, 1e-2, 1e-1)  # rad/s per sqrt(s)
-SHORT = 0.5  # s of simulation over which settings are compared
+SHORT = 0.5  # s; length of the simulations by which settings are compared
 PERIODS = 3  # repetitions of the settled period joined end to end for the filters, which need time to converge
 
 Fit = InverseDynamics | Filtered

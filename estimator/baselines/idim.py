@@ -21,7 +21,7 @@ from hil.estimator.errors import RecordingError, UnidentifiableError
 from hil.estimator.models.regressor import regressor
 from hil.estimator.models.terms import base_names
 
-ORDER = 4  # of the Butterworth filter, doubled by filtering in both directions
+ORDER = 4  # order of the Butterworth filter, doubled by filtering in both directions
 TRIM = 1.5  # cycles of the cut-off frequency discarded at either end because of filter transients
 PER_CYCLE = 5.0  # samples kept per cycle of the cut-off frequency
 WORST_CONDITION = 1e8

@@ -3,8 +3,8 @@ positions.
 
 State: angles, velocities, base parameters. Between samples the motion is integrated by Runge-Kutta steps under the mean
 motor torque; the parameters are constant except for a little process noise; each sample corrects the whole state. EKF:
-Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with the integrated step's Jacobian from finite
-differences. UKF: Julier and Uhlmann, Proc. IEEE 92 (2004) 401, symmetric sigma points.
+Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with the Jacobian of the integrated step computed
+by finite differences. UKF: Julier and Uhlmann, Proc. IEEE 92 (2004) 401, symmetric sigma points.
 
 The filters are given every fair advantage: the same dynamics as the likelihood, an initial guess from filtered least
 squares with a realistic spread, several passes over the recording, and noise levels that the caller can tune.
@@ -25,8 +25,8 @@ from hil.estimator.models.terms import base_names
 
 PASSES = 3
 LONGEST_STEP = 1.3e-3  # s
-SPREAD = 0.1  # initial standard deviation as a fraction of the parameter; the UKF's sigma points are 4 times as far out
-LEAST_SPREAD = 0.02  # its minimum, as a fraction of the largest parameter of the same kind
+SPREAD = 0.1  # initial standard deviation, relative to the parameter; the UKF's sigma points lie 4 times as far out
+LEAST_SPREAD = 0.02  # minimum of that deviation, relative to the largest parameter of the same kind
 DIFFERENCE = 1e-6
 # The twelve constants of the compiled arm; a one-joint arm uses five of them.
 SLOTS = CONSTANTS[:12]

@@ -16,7 +16,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.models.regressor import regressor
 from hil.estimator.models.terms import base_names
 
-ORDER = 4  # of the filter
+ORDER = 4  # order of the filter
 WIDE = 1e3  # standard deviation of the parameters before the first sample, in SI units
 WARM_UP = 2.0  # cycles of the cut-off frequency until the filters' initial transients have decayed
 
@@ -51,7 +51,8 @@ def _causal_rows(recording: Recording, cutoff: float, width: float, delay: float
     tau, _ = sosfilt(filter_, torque, axis=1, zi=rest * torque[None, :, :1])
     velocity = np.diff(smooth, axis=1) / dt
     acceleration = np.diff(velocity, axis=1) / dt
-    # A difference belongs to the middle of its interval: one sample back for the second derivative, half for the first.
+    # A difference belongs to the middle of its interval: one sample back for the second derivative, half a sample for
+    # the first.
     velocity = 0.5 * (velocity[:, 1:] + velocity[:, :-1])
     Y = regressor(smooth[:, 1:-1], velocity, acceleration, width)
     start = sosfilt_zi(filter_)[:, None, :, None]

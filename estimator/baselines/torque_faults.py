@@ -22,20 +22,20 @@ BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
 """Clipping levels to try, each given as the fraction of samples that exceed it."""
 OUTERMOST = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4])
 """Angles at which to try a mechanical stop, each given as the fraction of samples beyond it."""
-INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
-DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
-LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
-FEWEST_STEPS = 2  # sampling intervals between the best delays of two joints
-UNEVEN = 0.85  # ratio of a joint's residuals at its best delay and at the other joint's, below which these differ
+INTERVALS = np.arange(-4.0, 4.1)  # constant delays to try, in sampling intervals
+DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # total drifts to try, likewise
+LATEST = 0.06  # s; largest delay to try between the torque of one joint and those of the others
+FEWEST_STEPS = 2  # least difference between the best delays of two joints, in sampling intervals
+UNEVEN = 0.85  # largest ratio of a joint's residual at its own best delay to that at the other joint's best delay
 EXPLAINED = 0.3  # relative residual of each joint at its best delay, above which the torque does not fit at all
-EVALUATIONS = 30  # of the search for delay and drift
+EVALUATIONS = 30  # maximum number in the search for delay and drift
 MOST_SAMPLES = 30_000  # more would take too long
 
 
 @dataclass(frozen=True)
 class Clipped:
-    """A joint whose torque seems limited to `level` [N m], although the torque column exceeds it in the fraction
-    `beyond` of the samples.
+    """A joint whose torque seems to be limited to `level` [N m], although the torque column exceeds this level in a
+    fraction `beyond` of the samples.
 
     residual, residual_given: relative RMS of the joint's torque residual, with the limit and with the torque as given.
     """
@@ -119,7 +119,7 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
         tried = []
         for beyond in BEYOND.tolist():
             level = float(np.quantile(size, 1.0 - beyond))
-            if level == 0.0:  # most commands are zero, which no limit explains
+            if level == 0.0:  # most commands are zero: clipping cannot cause that
                 continue
             limit = np.where(np.arange(recordings[0].joints) == joint, level, np.inf)[:, None]
             left = _residuals([replace(each, torque=np.clip(each.torque, -limit, limit)) for each in recordings])
@@ -132,7 +132,7 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
 
 
 def suspect_stop(recordings: Sequence[Recording]) -> Stop | None:
-    """Return the mechanical stop that explains the motion much better than both the torque alone and springs; None if
+    """Return the mechanical stop that explains the motion much better than the torque alone or springs would; None if
     there is none.
     """
     joints = recordings[0].joints
@@ -167,7 +167,7 @@ def _springs(positions: Array) -> Array:
 
 
 def suspect_late(recordings: Sequence[Recording]) -> Late | None:
-    """Return the joint whose torque has a separate delay, if this explains the motion much better than a common one."""
+    """Return a joint whose torque has its own delay if that explains the motion much better than a common delay."""
     joints = recordings[0].joints
     if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
         return None
@@ -189,7 +189,7 @@ def suspect_late(recordings: Sequence[Recording]) -> Late | None:
 
 
 def suspect_uneven(recordings: Sequence[Recording]) -> Uneven | None:
-    """Return two joints whose best delays, each judged by the joint's own residual, differ; None if there are none."""
+    """Return two joints with different best delays, each based on the joint's own residual; None if there are none."""
     joints = recordings[0].joints
     if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
         return None

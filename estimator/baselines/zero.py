@@ -13,13 +13,13 @@ from hil.estimator.errors import EstimationError
 from hil.estimator.models.terms import base_names
 
 CUTOFF, WIDTH = 8.0, 0.05  # Hz, rad/s
-EXPLAINED = 0.5  # maximum ratio of the torque's residual with free zero angles to that with the given ones
-LEAST = 0.3  # rad: smaller zero errors are estimated by the fit
+EXPLAINED = 0.5  # maximum ratio of the torque residual with free zero angles to that with the given ones
+LEAST = 0.3  # rad; the fit itself can estimate smaller zero errors
 QUARTER, TIE = 0.5 * np.pi, 1.05
 """Zeros that are multiples of QUARTER [rad] are preferred if their residual is less than TIE times the smallest, since
 a weak or slow motion determines the zero of joint 2 poorly.
 """
-SURE = 0.05  # fraction of the largest torque: weaker gravity does not reveal an angle
+SURE = 0.05  # fraction of the largest torque; a weaker gravity torque does not reveal an angle
 
 
 def turned_zeros(recordings: Sequence[Recording]) -> Array | None:

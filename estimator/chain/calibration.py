@@ -57,7 +57,8 @@ class ChainCalibration:
     estimate: ChainEstimate
     """The fit, in units of the first joint's assumed torque constant."""
     value: Array
-    """Values of `ChainModel.linear_names` without the mass, scaled to the identified torque constants [SI]."""
+    """Parameters `ChainModel.linear_names` of the arm without the mass, scaled to the identified torque constants [SI].
+    """
     std: Array
     residual_steps: Array
     """RMS of the residual in encoder steps (runs, joints)."""

@@ -99,7 +99,7 @@ def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, 
 
 
 def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) -> float:
-    """Return twice the gain in log likelihood minus the value expected by chance, for unknown noise levels.
+    """For unknown noise levels, return twice the gain in log likelihood, less the amount expected by chance.
 
     The residual's correlation is taken from the richer model, since terms missing from the simpler one are not noise.
     """

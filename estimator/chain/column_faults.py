@@ -3,7 +3,7 @@ scale.
 
 As for planar arms (`hil.estimator.baselines.signs`), the torque residual of filtered inverse dynamics with a column
 changed is compared with the residual for the columns as given. Changing the signs and scale factors of torques only
-changes how the joints' normal equations are combined, so all combinations can be tried.
+changes how the joints' normal equations are combined, so that all combinations can be tried quickly.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,21 +26,21 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError, RecordingError
 
 SUSPICIOUS = 0.1  # relative torque residual of the worst joint, below which only contradictory torques are sought
-CLEAR = 0.5  # largest ratio of the worst joint's residuals, with a change and as given
+CLEAR = 0.5  # largest ratio of the worst joint's residual with a change to that without it
 WELL = 0.3  # largest relative residual with a change
 GAIN = 0.03  # minimum decrease in the log residual, averaged over the joints, for credible torque factors
 AS_WELL = 1.05  # ratio of the residuals up to which fewer reversals are preferred
-EQUALLY_FAR = 4.0  # difference in squared distance to the description that decides between two reversals
+EQUALLY_FAR = 4.0  # smallest difference in squared distance to the description that decides between two reversals
 SIGNIFICANT = 3.0  # standard errors
-FACTORS = np.exp(np.linspace(-np.log(6.0), np.log(6.0), 41))  # torque factors that are tried
-STEPS = 1.0 + 0.08 * np.linspace(-1.0, 1.0, 17)  # by which the best factor is refined
+FACTORS = np.exp(np.linspace(-np.log(6.0), np.log(6.0), 41))  # torque factors to try
+STEPS = 1.0 + 0.08 * np.linspace(-1.0, 1.0, 17)  # factors by which to refine the best one
 RIDGE = 1e-12  # added to normal equations of unit diagonal, so that they stay nonsingular if a joint hardly moves
-SWEEPS = 3  # over the joints
-DELAYS = 0.005 * np.arange(-12, 13)  # s: delays of the torques that are tried
+SWEEPS = 3  # number of sweeps over the joints
+DELAYS = 0.005 * np.arange(-12, 13)  # s: torque delays to try
 LEAST_LATE = 0.01  # s
-LATE = 0.6  # largest ratio of a joint's residuals, with a delay and as given
+LATE = 0.6  # largest ratio of a joint's residual with a delay to that without it
 ONE_LATE = 0.3  # decrease in the log residuals, beyond that of a common delay, that makes a delay of one joint credible
-TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 10.0])  # factors that are tried
+TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 10.0])  # time scales to try
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Reversed:
     """Reversed columns.
 
     residuals: relative RMS of the worst joint's torque residual with the change and without it.
-    impossible: whether friction is negative with the columns as given. This happens if all torques, or columns of a
-    first joint with a vertical axis, are reversed.
+    impossible: whether friction is negative with the columns as given. This happens if all torques are reversed, or the
+    torque or position of a first joint whose axis is vertical.
     """
 
     residuals: tuple[float, float]
@@ -112,7 +112,7 @@ class _Solved:
 
 @dataclass(frozen=True)
 class ColumnCheck:
-    """Recordings of a chain whose columns are in doubt. cutoff [Hz], delay [s]: see `filtered_torques`."""
+    """A chain's recordings, whose columns may be wrong. cutoff [Hz], delay [s]: see `filtered_torques`."""
 
     recordings: Sequence[Recording]
     model: ChainModel
@@ -241,7 +241,7 @@ class ColumnCheck:
         return tuple(factors.tolist())
 
     def wrong_times(self) -> WrongTimes | None:
-        """The time scale that explains the recordings much better than 1, given gravity and the described geometry."""
+        """The time scale that explains the recordings much better than a scale of 1, given gravity and geometry."""
         given = self._given[1]
         if not np.any(self.model.base.chain.gravity):
             return None

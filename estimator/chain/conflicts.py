@@ -1,4 +1,4 @@
-"""Values of a spatial arm that contradict its description, its configuration or typical servo parameters."""
+"""Identified values of a spatial arm that contradict its description, its configuration or typical servo parameters."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.models.conflicts import Conflict, Source, conflict, worst_first
 
 DRIVES = ("back_emf", "lag_ratio")
-"""Drive terms whose typical values are known beforehand; the other terms of `SHAPES` may be zero."""
+"""Drive terms that are compared with typical values. The other terms of `SHAPES` are not, since they may be zero."""
 
 
 def chain_conflicts(names: tuple[str, ...], value: Array, std: Array, prior: Prior) -> tuple[Conflict, ...]:

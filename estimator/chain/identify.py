@@ -28,7 +28,7 @@ this value.
 """
 
 SYSTEMATIC = 1.1
-"""The residual contains a model error rather than noise if the ratio of a base parameter's standard error to that under
+"""The residual contains model errors, not only noise, if the ratio of a base parameter's standard error to that under
 white noise exceeds this value.
 
 The ratio is 0.6 to 0.9 for encoder rounding and noise. Torque ripple of 0.2 %, or load-dependent friction of 0.3 % of
@@ -40,7 +40,7 @@ SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005
 less than the usual error of a manually adjusted zero.
 """
 
-BELIEVED = 0.5  # values whose standard error under white noise exceeds this fraction of the prior's come from the prior
+BELIEVED = 0.5  # largest standard error under white noise, relative to the prior's, of a value that the data determine
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def _best_fit(
         if before <= EXPLAINED_RESIDUAL:
             break
         if np.all(best.value[widths] <= width):
-            continue  # it would start from the minimum itself
+            continue  # that fit would start from the minimum itself
         with suppress(ConvergenceError):
             narrow = replace(options, initial_width=width)
             again = fit_periods(periods, model, linear, prior, narrow, added, best)

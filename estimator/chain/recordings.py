@@ -26,10 +26,10 @@ from hil.estimator.errors import ModelError, RecordingError
 from hil.estimator.fit.covariance import autocorrelation
 from hil.estimator.models.conflicts import Conflict
 
-CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the regression: the first one that the recordings' rate and length allow is used
+CUTOFFS = (8.0, 4.0, 2.0)  # Hz; the regression uses the first one that the recordings' rate and length allow
 LAG = 1e-3  # s: typical lag of a current loop, assumed by the regression
 MOVES = 0.05  # mean absolute smoothed sign of velocity below which a joint counts as standing still
-VELOCITY_SAMPLES = 9  # at the beginning, from which the initial velocity is taken
+VELOCITY_SAMPLES = 9  # number of samples from which the initial velocity is taken
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,6 @@
-"""Fourier coefficients of a settled period: noise, cut-off, exact derivatives, the held command."""
+"""Fourier coefficients of a settled period, and what follows from them: noise, cut-off, exact derivatives, held
+commands.
+"""
 
 from dataclasses import dataclass
 
@@ -10,10 +12,10 @@ from hil.estimator.arrays import Array, Mask
 Lines = npt.NDArray[np.complex128]
 
 SIGNAL_OVER_NOISE = 4.0  # power ratio above which a band of lines counts as signal
-BAND = 8  # lines that are evaluated together
+BAND = 8  # number of lines that are evaluated together
 
 
-_DRAWS = 16  # of interpolated white noise, for a standard deviation accurate to about 1 %
+_DRAWS = 16  # draws of interpolated white noise, for a standard deviation accurate to about 1 %
 _AHEAD = np.array((3.0, -3.0, 1.0))
 """Weights of the three nearest samples, nearest first, for quadratic extrapolation by one sample."""
 
@@ -91,7 +93,7 @@ def _interpolated_noise(valid: Mask) -> float:
 
 
 def interpolated_noise(valid: Mask) -> Array:
-    """Return white noise of standard deviation 1 (draws, samples), with samples that are not `valid` interpolated."""
+    """Return white noise of standard deviation 1 (draws, samples), interpolated wherever samples are not `valid`."""
     index = np.arange(valid.size)
     drawn = np.random.default_rng(_DRAWS).standard_normal((_DRAWS, valid.size))
     drawn[:, ~valid] = [np.interp(index[~valid], index[valid], row[valid]) for row in drawn]
@@ -99,7 +101,8 @@ def interpolated_noise(valid: Mask) -> Array:
 
 
 def _jump(position: Array) -> Array:
-    """Return the gap between the ends of a period (joints, samples) minus the motion between two samples (joints,).
+    """Return the gap (joints,) between the ends of a period (joints, samples), less the motion in one sampling
+    interval.
 
     At low rates, a joint moves by many encoder steps from the last sample of a period to the first of the next.
     """

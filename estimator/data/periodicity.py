@@ -17,7 +17,7 @@ WARMEST = 0.25  # largest change from period to period while friction warms up
 ALIKE = (
     0.8  # minimum correlation of successive changes while friction warms up, as it always changes in the same direction
 )
-MOST_PERIODS = 100  # advice to use more would not be helpful
+MOST_PERIODS = 100  # largest number of periods that is advised
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ Between = Literal["held", "linear"]
 FEWEST_SAMPLES = 32
 LEAST_VALID = 0.5  # minimum fraction of a joint's samples that must be valid
 LEAST_MOTION = 4.0  # minimum range of motion in encoder steps
-MOST_GAP = 0.2  # s between samples; with longer intervals the motion would not be resolved
+MOST_GAP = 0.2  # s between samples; longer intervals would not resolve the motion
 MOST_INTERVALS, SHORTEST_GAP = 8.0, 0.04  # gaps exceed both this many typical intervals and this many seconds
-LONGEST_GAP = 10.0  # s within one recording
+LONGEST_GAP = 10.0  # s; longest gap within one recording
 LEAST_NOISE = 1e-5  # rad: lower bound for any arm's encoder
-MOST_ANGLE = 200.0  # rad: larger values must be degrees or encoder steps
+MOST_ANGLE = 200.0  # rad; larger values must be in degrees or encoder steps
 MOST_SPEED = 500.0  # rad/s between samples, likewise
 MOST_TORQUE = 1e4  # N m
 

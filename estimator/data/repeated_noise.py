@@ -26,10 +26,10 @@ from hil.estimator.data.fourier import interpolated_noise, slow_part, white_nois
 
 __all__ = ["agreed_noise", "coloured_noise", "repeated_noise"]
 
-FEWEST = 20  # samples of a pass; at 20 Hz, half a period of 2 s
+FEWEST = 20  # minimum number of samples in a pass; at 20 Hz, half a period of 2 s
 ROUNDING = 1.0 / 12.0  # steps^2
 AGREE = 2.0  # standard errors
-_LINES = 8.0  # number of samples of a period per line used to measure its noise
+_LINES = 8.0  # a period's noise is measured from one line per this many samples
 _LINE_ERROR = 0.72  # relative standard error of the noise from the median power of one line
 _STD = np.linspace(0.0, 1.0, 401)
 _ORDERS = np.arange(1, 30)

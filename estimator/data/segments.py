@@ -44,7 +44,7 @@ class RecordingSegment:
         """Interpolate values on the grid (joints, grid points, ...) at the sampling times (joints, samples, ...)."""
         weight = self.weight.reshape(*self.weight.shape, *(1,) * (grid.ndim - 2))
         values = np.zeros((grid.shape[0], len(self.index), *grid.shape[2:]))
-        with np.errstate(invalid="ignore"):  # of a simulation that has diverged; the fit rejects it
+        with np.errstate(invalid="ignore"):  # if the simulation has diverged, in which case the fit rejects it
             for n in range(4):
                 values += grid[:, self.index[:, n]] * weight[:, n]
         return values

@@ -19,7 +19,7 @@ MOST_SPIKES = 0.05  # fraction of spikes above which they are assumed to be real
 LEAST_VALID = 0.5  # minimum fraction of a joint's samples that must be valid
 LEAST_MOTION = 4.0  # minimum range of motion in encoder steps
 MOST_GAP = 4.0  # allowed gap from the last sample to the first, relative to the largest change between neighbours
-MOST_DRIFT = 0.1  # allowed gap relative to the range of motion
+MOST_DRIFT = 0.1  # allowed gap from the last sample to the first, relative to the range of motion
 
 
 @dataclass(frozen=True)

@@ -189,7 +189,7 @@ class _Posed:
         return value if self._hypothesis is None else self._altered.sizes(self._hypothesis, value)
 
     def begun(self, value: Array, unknowns: Array) -> Array:
-        """Return the fit's shared coordinates for these parameters and unknowns of the defect."""
+        """Return the fit's shared coordinates for these values of the parameters and of the defect's unknowns."""
         return np.concatenate((self.coordinates.coordinates(value), self._altered.offsets, unknowns))
 
     def minimum(self, shared: Array, own: Array, ftol: float = OPTIONS.ftol_refine) -> Segmented:

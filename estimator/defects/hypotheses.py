@@ -20,10 +20,10 @@ CourseKind = Literal["always", "step", "linear", "decay", "recording"]
 Direction = Mapping[str, float]
 """Change in each parameter per unit of an unknown, as a fraction of the parameter; for an offset, in N m."""
 
-MOST_STEPS = 24  # instants at which a sudden change is tried
-EDGE = 2  # segments before and after a sudden change
-DECAYS = (0.15, 0.4, 1.0)  # time constants, relative to the duration of the longest recording
-MOST_RECORDINGS = 4  # each is compared with the others
+MOST_STEPS = 24  # largest number of instants at which a sudden change is tried
+EDGE = 2  # minimum number of segments before and after a sudden change
+DECAYS = (0.15, 0.4, 1.0)  # time constants to try, relative to the duration of the longest recording
+MOST_RECORDINGS = 4  # with at most this many recordings, each is compared with the others
 TORQUE_UNITS = ("kg m^2", "N m", "N m s/rad", "N m/rad")
 
 
@@ -109,7 +109,7 @@ def _changes(
 
 
 def _load(joints: int) -> tuple[Direction, ...]:
-    """Return the effects of a mass anywhere on the last link; its first moment changes gravity_2 and coupling alike."""
+    """Return the effects of a mass on the last link; its first moment scales gravity_2 and coupling by one factor."""
     if joints == 1:
         return ({"inertia_1": 1.0}, {"gravity_1": 1.0})
     return ({"inertia_1": 1.0}, {"gravity_1": 1.0}, {"gravity_2": 1.0, "coupling": 1.0}, {"inertia_2": 1.0})

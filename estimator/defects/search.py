@@ -23,10 +23,10 @@ from hil.estimator.selection.candidates import colour
 
 FEWEST_SEGMENTS = 6
 MOST_SEGMENTS = 400  # more would take too long
-EXPLAINED = 1.2  # mean square of the residual, relative to the noise
-FITTED = 3  # number of hypotheses, which differ in kind or joint
-PROMISING = 0.45  # fraction of the residual beyond the noise: a hypothesis below it is dropped
-CERTAIN = 2.0  # decrease in the sum of squares relative to that expected by chance
+EXPLAINED = 1.2  # mean square of the residual, relative to the noise, above which neighbouring instants are tried
+FITTED = 3  # number of hypotheses to fit, which differ in kind or joint
+PROMISING = 0.45  # a hypothesis that explains less than this fraction of the residual beyond the noise is dropped
+CERTAIN = 2.0  # minimum decrease in the sum of squares, relative to that expected by chance
 LEAST = {"scale": 0.01, "load": 0.02, "friction": 0.04, "torque": 0.01, "offset": 0.01, "arm": 0.03}
 """Smallest change that matters, as a fraction of the parameters; for an offset, as a fraction of the RMS torque."""
 

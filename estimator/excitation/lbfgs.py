@@ -1,7 +1,7 @@
 """Smooth minimisation by limited-memory BFGS (Nocedal and Wright, Numerical Optimization, 2nd ed., algorithm 7.5).
 
-It is implemented here because a seed must give the same phases on every machine. With a library's BLAS, the wave would
-differ by up to 4e-4 of its peak (docs/dependencies.md).
+It is implemented here because a seed must give the same phases on every machine. With a library's BLAS, the waves of
+two machines could differ by up to 4e-4 of the peak (docs/dependencies.md).
 """
 
 from collections import deque
@@ -17,9 +17,9 @@ Function = Callable[[Array], tuple[float, Array]]
 MEMORY = 20  # steps remembered
 HALVINGS = 20
 ENOUGH = 1e-4  # minimum decrease as a fraction of that predicted by the slope
-GRID = 2.0**-24  # multiple to which each step is rounded
+GRID = 2.0**-24  # steps are rounded to a multiple of this
 Pairs = deque[tuple[Array, Array, float]]
-_sum: Callable[[Array], Any] = np.add.reduce  # np.sum takes three times as long for this few numbers
+_sum: Callable[[Array], Any] = np.add.reduce  # np.sum takes three times as long for so few numbers
 
 
 def descend(function: Function, x: Array, steps: int) -> Array:

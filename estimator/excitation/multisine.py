@@ -23,8 +23,8 @@ Harmonics = npt.NDArray[np.int64]
 
 DETECTION = 4  # one of this many odd lines is left unexcited
 NORMS = (4, 16, 64)  # p of the L2p norms, in order of use
-FINAL_NORMS = (64, 256)  # the same for the best candidate
-STARTS = 4  # random initial phases in addition to Schroeder's
+FINAL_NORMS = (64, 256)  # the same p, for the best candidate
+STARTS = 4  # number of random initial guesses of the phases, in addition to Schroeder's
 ITERATIONS = 40  # per norm
 OVERSAMPLING = 8  # samples per cycle of the highest line while phases are optimised
 FINAL_OVERSAMPLING = 24  # the same for the best candidate, so that no peaks remain between samples

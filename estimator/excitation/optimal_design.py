@@ -2,7 +2,7 @@
 
 The standard errors are those of the likelihood (`hil.estimator.fit.stage2`) on one settled period. The search is a
 (1+1) evolution strategy with step-size control by Rechenberg's success rule: first over the shape of the amplitude
-spectra and the extent of each joint's motion, then over the phases as well. Source of the criterion: Pronzato and
+spectra and the extent of each joint's motion, then over the phases as well. The criterion is described in Pronzato and
 Pazman, "Design of experiments in nonlinear models", 2013, chapter 5 (E and minimax criteria).
 """
 
@@ -20,7 +20,7 @@ from hil.estimator.models.terms import extra_names
 from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
 from hil.estimator.threads import thread_count
 
-KNOTS = 4  # of each joint's amplitude spectrum, over the logarithm of the line number
+KNOTS = 4  # number of knots of each joint's amplitude spectrum, over the logarithm of the line number
 SHAPE_TRIALS = 60
 PHASE_TRIALS = 60
 DIFFERENCE = 1e-3  # finite difference: relative for a parameter, absolute for the state [rad, rad/s]

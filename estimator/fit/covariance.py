@@ -22,9 +22,9 @@ from hil.estimator.fit.normal_equations import normal_equations
 from hil.estimator.options import CovarianceOptions
 
 DEFAULTS = CovarianceOptions()
-FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates stay finite
-SENSITIVE = 1e7  # largest change in a sample, in units of the noise, per unit of a coordinate (RMS)
-LEAST_INFORMATION = 1e-13  # for a combination of coordinates, relative to each alone; anything less is rounding error
+FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates have finite variances
+SENSITIVE = 1e7  # largest RMS change of the samples, in units of the noise, per unit change of a coordinate
+LEAST_INFORMATION = 1e-13  # information on a combination of coordinates, relative to each alone; less is rounding error
 VANISHED = 1e-3  # ratio of slope to value below which a parameter has run into its floor
 
 
@@ -55,7 +55,7 @@ class Scatter:
 
 
 def correlation_time(residuals: Sequence[Array], options: CovarianceOptions = DEFAULTS) -> int:
-    """Return twice the lag [samples] beyond which no residual (joints, samples) of any run is correlated.
+    """Return twice the lag [samples] beyond which no residual (joints, samples) of any run is autocorrelated.
 
     That lag is the first at which the autocorrelation falls into the range expected of white noise.
     """
@@ -102,7 +102,7 @@ def robust_covariance(
     structured: float = 0.0,
     expected: Array | None = None,
 ) -> Array:
-    """Return the covariance of the first `count` coordinates (count, count) if all coordinates are unknown.
+    """Return the covariance of the first `count` coordinates (count, count), treating all coordinates as unknown.
 
     In every direction, it is the larger of the sandwich and the covariance for independent errors, since a short
     recording cannot prove that its errors cancel. It is infinite for a coordinate without influence on the residual.

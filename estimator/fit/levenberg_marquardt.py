@@ -45,7 +45,7 @@ Move = Callable[[Array, Array], Array]
 Limits = Callable[[Array], tuple[Array, Array]]
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of motions that diverge; their sum is not finite
+@np.errstate(over="ignore", invalid="ignore")  # for motions that diverge, whose sum is not finite
 def minimise(
     evaluate: Evaluate,
     start: Array,
@@ -147,8 +147,9 @@ class _Trials:
                 there = self._evaluated(moved)
                 if there.cost < self.at.cost:
                     return (moved, there), max(options.min_damping, taken * trusted)
-            # Also if `cost` indicated a decrease that the normal equations' simulation does not confirm. Damping rises
-            # from that of the first step, not from that of a less damped one, or the search would never end.
+            # This point is also reached if `cost` indicated a decrease that the normal equations' simulation does not
+            # confirm. The damping of the first step is raised, not that of a less damped one, or the search would never
+            # end.
             damping = max(10.0 * damping, options.initial_damping)
         return None, damping
 

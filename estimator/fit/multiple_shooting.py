@@ -35,8 +35,8 @@ from hil.estimator.simulation.presliding_sensitivity import sensitive
 DEFAULTS = ShootingOptions()
 ALL = slice(None)
 MOST_WEIGHT = 1e9
-ENOUGH = 1.25  # samples of a short segment at a low rate, relative to FEWEST
-MOST_SHORT = 0.6  # of a segment: short ones that would have to be longer are not tried
+ENOUGH = 1.25  # minimum number of samples in a short segment, relative to FEWEST
+MOST_SHORT = 0.6  # short segments are not tried if they had to be longer than this fraction of a segment
 
 
 @dataclass(frozen=True)
@@ -136,8 +136,8 @@ class Shooting:
     def position_by_values(
         self, segment: RecordingSegment, values: Mapping[str, float], offsets: Array, own: Array
     ) -> Array:
-        """Return the simulated positions for given parameters [SI], `offsets` of the zeros and coordinates of the
-        segment.
+        """Return the simulated positions for parameter values [SI], `offsets` of the zeros, and the segment's own
+        coordinates.
         """
         state = own.reshape(2, -1) * self.state_scale
         return self.position(segment, self._with_zeros(values, segment, offsets), state)

@@ -1,4 +1,4 @@
-"""Minimisation of the likelihood from several initial guesses, with coarse integration steps first.
+"""Maximum-likelihood fit from several initial guesses, first with coarse integration steps.
 
 Fine steps then decide between minima that coarse ones cannot separate. Each joint's noise level is estimated before the
 final iterations, which downweight outliers (Huber) so that a few corrupted readings do no harm.
@@ -88,7 +88,9 @@ class Search:
         return self._undisguised(refined, replace(minimum, iterations=spent))
 
     def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
-        """Replace constant Stribeck rises with Coulomb friction, unless the fit becomes significantly worse."""
+        """Replace Stribeck rises that hardly fall in this motion with Coulomb friction, unless the fit becomes
+        significantly worse.
+        """
         if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
             return refined, minimum
         try:
@@ -103,7 +105,8 @@ class Search:
         options = self.options
         x = self.fine.coordinates.undisguised(x)
         found = Minimum(x, self.fine.evaluate(x), 1)
-        # Coarse steps lead away from a minimum where their motion is inaccurate: near a narrow friction step.
+        # Near a narrow friction step, the motion simulated with coarse steps is inaccurate, so a fit with them would
+        # leave the minimum.
         if abs(self.rough.evaluate(x).cost / found.at.cost - 1.0) < options.same_motion:
             found = self.rough.minimise(x, options.ftol_start)
         refined = self._compare([found], options.ftol_refine)

@@ -28,7 +28,8 @@ def noise_weights(
     outliers = 0
     for period, position in zip(periods, positions, strict=True):
         error = np.where(period.valid, np.abs(period.position - position), 0.0)
-        # The standard deviation is 1.15 times the median of rounding errors and 1.48 times that of normal errors.
+        # The standard deviation is 1.15 times the median magnitude for rounding errors, and 1.48 times for normal
+        # errors.
         typical = np.array([1.35 * np.median(row[valid]) for row, valid in zip(error, period.valid, strict=True)])
         spread = np.maximum(typical, period.noise)[:, None]
         far = error > threshold * spread

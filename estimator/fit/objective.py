@@ -134,7 +134,7 @@ class Objective:
         if not np.all(np.isfinite(physics.vector)):
             return np.inf
         total = self._expected(x).cost
-        with np.errstate(over="ignore", invalid="ignore"):  # of a motion that diverges
+        with np.errstate(over="ignore", invalid="ignore"):  # if a motion diverges
             for index, (run, weight) in enumerate(zip(self.runs, self.weights, strict=True)):
                 position = run.position(physics, self.start(x, index), self.tracking_stiffness, self.horizon)
                 samples = position.shape[1]

@@ -16,11 +16,11 @@ from hil.estimator.models.model import LEVER_STD, Model
 from hil.estimator.models.terms import BEYOND_SPEEDS, Scale, Term, joint_of, kind_of, term_of
 from hil.estimator.options import CoordinateOptions
 
-TYPICAL_SATURATION = 0.02  # typical fraction of the RMS torque lost; only a scale
+TYPICAL_SATURATION = 0.02  # typical lost fraction of the RMS torque; only a scale
 LEAST_WEIGHT = 0.02  # minimum gravity_2 to be used as a scale, as a fraction of the RMS torque
 TYPICAL_CABLE = 0.15  # stiffness of a stiff cable, as a fraction of the RMS torque per radian
 TYPICAL_COGGING = 0.01  # typical cogging, as a fraction of the RMS torque; only a scale
-LEAST_RISE = 0.05  # Stribeck rise above which it may stand for Coulomb friction
+LEAST_RISE = 0.05  # a Stribeck rise above this may really be Coulomb friction
 TYPICAL_SQUARE = 1.0 / 3.0  # mean squared speed of a joint, relative to its highest speed squared; only a guess
 MOST_DECREASE = 0.8  # maximum relative decrease in a base parameter in one step
 TYPICAL_BEND = 0.01  # rad: typical presliding deflection; only a scale

@@ -23,7 +23,7 @@ WAVES: tuple[Wave, ...] = get_args(Wave)
 """Options that add a torque that is periodic over the joint angle: proportional to the motor torque (ripple) or
 independent of it (cogging).
 """
-CYCLES = np.arange(3.0, 40.01, 0.25)  # per turn of the joint; slower variations come from gravity, cables, encoders
+CYCLES = np.arange(3.0, 40.01, 0.25)  # cycles per turn to try; fewer are due to gravity, cables or encoders
 COULOMB_WIDTH = LinearOptions().coulomb_width
 STRIBECK_VELOCITY = 0.15  # rad/s: a rough value suffices to separate the Stribeck rise from the ripple
 

@@ -318,9 +318,9 @@ def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Arr
 def _doubting(objective: Objective, minimum: Minimum, errors: _Errors) -> Objective:
     """Return the objective, with a wider prior on the length of link 1 if the motion contradicts that prior.
 
-    In a small motion, a wrong length would otherwise practically determine the coupling by itself, since the motion
-    contradicts it by little more than the standard error of the motion's own estimate. The prior's variance is
-    increased until a contradiction of this size is typical.
+    Without this, a wrong length would practically determine the coupling in a small motion: the motion's own estimate
+    differs from what this length implies by little more than its standard error. The prior's variance is increased
+    until a difference of this size is typical.
     """
     lever = objective.lever
     if lever is None or lever.is_doubted:

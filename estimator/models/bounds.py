@@ -16,7 +16,7 @@ from hil.estimator.models.terms import kind_of, term_of
 
 SURE = 3.0  # standard errors by which the best value must lie outside the range
 NEAR = 0.1  # distance from the bound, relative to the step beyond it, within which a fit counts as at the bound
-FAINTEST = 1e-140  # influence of a coordinate below which its square underflows
+FAINTEST = 1e-140  # the square of any smaller influence of a coordinate underflows
 MOVED = 1.0  # standard errors by which the bound must shift another parameter for that parameter to count as affected
 
 
@@ -88,7 +88,7 @@ def bound_sentence(names: Sequence[str]) -> str:
     late = any(kind_of(name) == "back_emf" for name in names)
     cause = (
         "The lagging back-EMF already cancels as much of the joint's inertia as is physically possible, so the inertia "
-        "and the lag may be wrong: check the joint's mode and servo model, and what else may delay its torque"
+        "and the lag may be wrong: check the joint's mode and servo model, and whether anything else delays its torque"
         if late
         else "This is due to an effect missing from the model or to too little motion, and it distorts other values: "
         "use wider and faster motion, and look for a cause among the findings above"

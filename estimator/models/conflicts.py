@@ -18,12 +18,12 @@ LARGE_RATIO, LARGE_ANGLE = 0.35, 0.3
 """Relative and absolute deviations [1, rad] from a configured value that are too large to be due to magnet temperature,
 tolerances or a horn fitted one tooth off.
 """
-LARGE_SPREAD = 0.3  # standard deviation of a logarithm that is printed as a factor
+LARGE_SPREAD = 0.3  # standard deviation of a logarithm above which it is printed as a factor
 Trust = Literal["yes", "with care", "no"]
 Source = Literal["file", "description", "servos"]
 """Origin of an expected value: the configuration, the description of the links (URDF), or typical servo parameters."""
 _GIVEN = ("torque_scale", "zero")
-"""Terms whose expected values come from the configuration: torque_constant and zero_ticks."""
+"""Terms whose expected values come from the configuration (from its keys torque_constant and zero_ticks)."""
 _SOURCES: dict[Source, str] = {
     "file": "implied by the configuration",
     "description": "implied by the description of the arm",
@@ -43,7 +43,7 @@ _LINK = "correct that link's mass, centre of mass and inertia in the description
 
 @dataclass(frozen=True)
 class Conflict:
-    """A value that is far from the one known beforehand."""
+    """An identified value that is far from the value known beforehand."""
 
     name: str
     value: float

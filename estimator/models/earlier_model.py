@@ -140,6 +140,6 @@ def unexplained(past: Any, j: int) -> float:
     return float(past[_SLOTS + 1, _FOUND + j])
 
 
-_inner = partial(inner, _nrt=False)  # none of them allocates memory
+_inner = partial(inner, _nrt=False)  # none of these functions allocates memory
 forget, add, describe, store, compare = map(_inner, (forget, add, describe, store, compare))
 keep, unexplained = map(_inner, (keep, unexplained))

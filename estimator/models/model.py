@@ -21,8 +21,8 @@ LEVER_STD = 0.05
 motion. That component depends on the configured tilt.
 """
 LEVER_DOUBTED = 1.2
-"""Deviation of the motion's own estimate from this prior, in standard deviations of their difference, above which the
-prior is widened.
+"""The prior (see `LEVER_STD`) is widened if it deviates from what the motion alone indicates by more than this number
+of standard deviations of the difference.
 """
 
 
@@ -54,7 +54,7 @@ class Model:
             encoder_sin_twice sin 2q + encoder_cos_twice cos 2q.
         lags: adds lag_difference to the lag of the second joint's torque or, without a lag, to its delay.
 
-    Raises ModelError for an unknown name, for torque_scale with one joint, and unless the arm has one or two joints.
+    Raises ModelError for an unknown name, for torque_scale with one joint, and for arms without one or two joints.
     """
 
     joints: int

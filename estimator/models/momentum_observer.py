@@ -51,7 +51,7 @@ NAMES = (
     *("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
     *("viscous_1", "viscous_2", "coulomb_1", "coulomb_2", "offset_1", "offset_2", "tilt_1", "tilt_2"),
 )
-"""Names of the parameters. Tilts are components of gravity perpendicular to the direction assumed for angle zero."""
+"""Names of the parameters. The tilts are gravity torques that follow the sines of the angles, due to a tilted base."""
 
 FILTER_S = 0.02
 HOLD_S = 0.05
@@ -66,10 +66,10 @@ _STANDING = 0.05  # rad/s below which dry friction may hold a joint
 _PLAY_RAD = 0.006  # backlash of a gear (0.0044 in a data sheet) plus encoder noise
 _STAYS_S = 0.03  # time within this play after which the direction of friction counts as unknown
 _STATIC = 1.5  # ratio of static to Coulomb friction
-_CERTAIN = 2.0  # standard deviations to subtract from an estimated torque so that the rest certainly acts
-_INERTIAS = 4  # number of inertial parameters, the first ones
+_CERTAIN = 2.0  # standard deviations to subtract from an estimated torque so that the remainder certainly acts
+_INERTIAS = 4  # number of inertial parameters, which come first
 _SHOWN = 2.5  # acceleration above which inertias are learnt, in standard deviations of its rounding error
-_VISIBLE = 2.0  # velocity that shows in the register, in standard deviations of its rounding error
+_VISIBLE = 2.0  # smallest velocity that shows in the register, in standard deviations of its rounding error
 _VELOCITY_STD = 0.0135  # rad/s: rounding of the register, whose resolution is 0.024, and some noise
 _FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned torque
 _NOISE_S = 1.0  # time constant of the noise estimate
@@ -78,7 +78,7 @@ _CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in vari
 _STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
 _LESSONS = 2.0  # number of successive updates that share one model error
 _STANDING_LESSONS = 28.0  # the same, for the rounding of velocities that stay below a tick while a joint hardly moves
-_DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # drift of a parameter per second, relative to its value and to its initial deviation
+_DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # drift per second, relative to a parameter and its initial standard deviation
 _MOST_WEIGHT = 6.0  # maximum weight of a sample whose residual torque far exceeds the threshold
 _OBVIOUS = 3.0  # multiple of the threshold at which one sample is enough at low rates
 _WARM_S = 3 * FILTER_S
@@ -293,7 +293,7 @@ def _is_blocked(
         return False
     friction = _static_friction(m, rest, j)
     variance = 2.0 * noise
-    if abs(distance) > 2.0 * friction:  # otherwise it makes no difference and would only cost time
+    if abs(distance) > 2.0 * friction:  # otherwise it cannot matter and would only take time to compute
         variance += _variance(rest, distance, row, m[_COVARIANCE:_PENDING])
     tolerance = max(TIMES * math.sqrt(variance), floor)
     momentum = _VISIBLE * math.sqrt(rounding) * FILTER_S
@@ -438,7 +438,7 @@ def _observe_loop(
         return -1
     single = m[_SINGLE]
     fallen = 1.0 - math.exp(-dt / FILTER_S)
-    slope = fallen / ((1.0 - fallen) * dt)  # from a value minus its filtered value to its filtered derivative
+    slope = fallen / ((1.0 - fallen) * dt)  # factor from a value minus its filtered value to its filtered derivative
     single[_LESSON] += dt
     single[_AGE] += dt
     is_warm = single[_AGE] > _WARM_S
@@ -486,7 +486,7 @@ def _observe_loop(
     return alarm
 
 
-_inner = partial(embedded, _nrt=False)  # none of them allocates memory
+_inner = partial(embedded, _nrt=False)  # none of these functions allocates memory
 _regressors, _begin_anew, _filter = map(_inner, (_regressors, _begin_anew, _filter))
 _gain, _lacks, _learn = map(_inner, (_gain, _lacks, _learn))
 _keep_dissipative = _inner(_keep_dissipative)

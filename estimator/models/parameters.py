@@ -16,7 +16,7 @@ ABSENT = {name: term_of(name).absent for name in CONSTANTS}
 ENCODER = tuple(name for name, term in TERMS.items() if term.part == "encoder")
 """Terms that describe encoder errors periodic over a turn."""
 LEAST_LAG = 1e-6  # s
-SLIDING = 0.05  # rad/s: velocity above which a joint slides, with its bristles deflected in that direction
+SLIDING = 0.05  # rad/s: velocity above which a joint slides, with its bristles deflected in the direction of motion
 
 
 LEAST_INERTIA = 0.2

@@ -29,7 +29,7 @@ Link i has a mass, a centre of mass (distance from joint i) and an inertia about
 distance from joint 1 to joint 2; mass_elbow is the second servo's mass; armature_i is rotor inertia times gear ratio
 squared.
 """
-OPEN = 1e-6  # component of a quantity in the null space above which it is not determined
+OPEN = 1e-6  # a quantity with a larger component in the null space is not determined
 SINGULAR = 1e-9
 CONTRADICTION = 5.0  # standard errors
 

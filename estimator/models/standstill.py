@@ -143,7 +143,7 @@ def blocked(
     return bool(max(rest[_UP], rest[_DOWN]) > 2.0 * momentum and rest[_LASTS] >= HOLD_S)
 
 
-_inner = partial(inner, _nrt=False)  # none of them allocates memory
+_inner = partial(inner, _nrt=False)  # none of these functions allocates memory
 forget = _forget = _inner(forget)
 keep = _keep = _inner(keep)
 withstood, is_suspect, look, variance, blocked = map(_inner, (withstood, is_suspect, look, variance, blocked))

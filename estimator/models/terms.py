@@ -192,7 +192,7 @@ _DECLARED = (
     Term(
         "stribeck_rise",
         "1",
-        "Stribeck rise above Coulomb friction at low speed, as a fraction of it",
+        "Stribeck rise at low speed, as a fraction of Coulomb friction",
         part="stribeck",
         initial=0.2,
         largest=10.0,

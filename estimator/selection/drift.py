@@ -3,7 +3,7 @@
 A fit of one period, or of the mean of several, is valid for the middle of their time span. Other periods then show
 whether friction was larger or smaller: the difference in motion is nearly linear in one factor per joint, which
 multiplies viscous and dry friction, and in the period's initial state. Alternatively, a constant torque in only one of
-the periods can be the cause.
+the periods may have caused the difference.
 """
 
 from collections.abc import Sequence
@@ -23,10 +23,10 @@ from hil.estimator.selection.candidates import by_parameters, colour, linearised
 ITERATIONS = 3
 LEAST = 0.005  # minimum relative change in friction that matters
 MOST = 0.3  # maximum relative change in friction in one iteration
-SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step, tried until the prediction improves
-TELLS = 0.5  # fraction of the residual after a change in friction below which a constant torque explains it better
+SHARES = (1.0, 0.5, 0.2, 0.05)  # fractions of a step, tried in turn until the prediction improves
+TELLS = 0.5  # a constant torque explains more if it leaves less than this fraction of what a change in friction leaves
 NOTICED = 0.01  # constant torque, relative to the joint's RMS torque, below which it does not matter
-UNEVEN = 0.25  # relative part of a change that is not linear in time, or not the same for all friction
+UNEVEN = 0.25  # fraction of a change that may not be linear in time, or not the same for all friction terms
 SCALED = ("viscous", "coulomb", "load", "viscous_asymmetry")
 
 

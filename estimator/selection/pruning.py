@@ -25,7 +25,8 @@ def without_nothings(estimate: Estimate, level: float, fixed: Option | None) -> 
 def pruned_model(
     model: Model, names: Sequence[str], value: Array, covariance: Array, level: float, fixed: Option | None
 ) -> Model:
-    """Return `model` without the parts that do not differ significantly from zero at `level`; `fixed` is kept.
+    """Return `model` without the parts that do not differ significantly from zero at `level`; the option `fixed` is
+    kept.
 
     value, covariance: parameters (parameters,) and their covariance, in the order of `names`.
     """

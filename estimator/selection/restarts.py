@@ -18,7 +18,7 @@ from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.waves import ranked_cycles, wave_peaks, without_height
 
 ALIKE_STIFFNESS = 3.0  # ratio of two stiffnesses below which no minimum is expected between them
-WIDE = 0.5  # width of the Coulomb step over the Stribeck velocity above which the two cannot be separated
+WIDE = 0.5  # ratio of Coulomb step width to Stribeck velocity above which the two cannot be separated
 NARROW = 1e-3  # rad/s: initial width of a step that replaces a Stribeck rise
 ALIKE_CYCLES = 0.3  # difference in cycles per turn below which no other minimum is expected
 

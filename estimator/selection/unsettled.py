@@ -33,8 +33,8 @@ SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable")
 FINE = ShootingOptions()
 QUICK = ShootingOptions(ftol=1e-3, max_step=FINE.coarse_step, reweightings=1)
 """Options for fits that are only compared with each other."""
-EXPLAINED = 1.1  # residual over noise: the noise is estimated from the same samples
-NEARLY = 1.5  # residual over noise up to which the likelihood can be trusted to choose
+EXPLAINED = 1.1  # ratio of residual to noise for an explained motion; the noise is estimated from the same samples
+NEARLY = 1.5  # ratio of residual to noise up to which the likelihood can be trusted to choose
 
 
 @dataclass(frozen=True)

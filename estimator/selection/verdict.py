@@ -21,16 +21,16 @@ from hil.estimator.selection.drift import LEAST, Drift, TorqueChange
 from hil.estimator.selection.validation import Validation
 
 EXPLAINED = 1.06  # ratio of residual to noise up to which the model explains the motion
-GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # prediction error relative to the motion's RMS
+GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # largest prediction error, relative to the motion's RMS
 LEAST_PERCENT = 0.01  # smallest prediction error that is reported; smaller ones are lost in the noise
 MUCH_LEFT = 5.0  # ratio of residual to noise above which parameters are doubtful without a held-out check
-WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
+WELL_KNOWN, WEAK = 0.02, 0.1  # limits on relative standard errors
 UNDETERMINED = 10.0  # ratio of standard error to value above which a parameter is not determined at all
 LITTLE_EFFECT = 0.02  # standard error of a parameter's torque, relative to the joint's, below which it hardly matters
 ALIKE = 0.99  # correlation above which two parameters are hard to separate
 NOTICEABLE = 0.005  # fraction of the residual that a term must explain to be mentioned
 NOISY = 1.25  # ratio of noise to rounding above which the noise is mentioned
-WARM_UP_TIMES, WARM_UP_ROUNDING = 4.0, 30.0  # relative to the time over which a change was observed; s
+WARM_UP_TIMES, WARM_UP_ROUNDING = 4.0, 30.0  # multiple of the time in which a change was seen; rounded to [s]
 IMPROVEMENT = {
     "inertia": "faster motion: raise the upper edge of experiment.band or {torque}",
     "coupling": "faster motion of both joints together: raise {torque}",
@@ -271,9 +271,10 @@ def _pushed(torque: TorqueChange | None) -> tuple[str, ...]:
         if seen
     )
     return (
-        f"Relative to the fitted motion, a constant torque of {found} acts in the held-out one. It explains the "
-        "difference better than a change in friction does. In one of the two motions, something pushed or pulled the "
-        "arm, a cable tightened, the arm carried something, or its base tilted. Remove the cause and record again.",
+        f"Compared with the fitted motion, an additional constant torque of {found} acts in the held-out one. It "
+        "explains the difference better than a change in friction does. In one of the two motions, something pushed or "
+        "pulled the arm, a cable tightened, the arm carried something, or its base tilted. Remove the cause and record "
+        "again.",
     )
 
 
@@ -342,12 +343,13 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
         share = 100 * validation.torque_std[name]
         if part > 1.0:
             return (
-                f"{name} cannot be distinguished from zero. It hardly affects this arm: its standard error is "
-                f"{share:.2g} % of the fitted motion's torque.",
+                f"{name} cannot be distinguished from zero. It hardly affects this arm: its standard error "
+                f"amounts to {share:.2g} % of the fitted motion's torque.",
             )
         return (
             f"The least certain parameter is {name}, known to within {percent(part)}. It hardly affects this arm: "
-            f"its standard error is {share:.2g} % of the fitted motion's torque. To improve it, use {improvement}.",
+            f"its standard error amounts to {share:.2g} % of the fitted motion's torque. To improve it, use "
+            f"{improvement}.",
         )
     if part >= UNDETERMINED:
         return (f"This motion does not determine {name}. To identify it, use {improvement}.",)

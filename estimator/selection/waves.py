@@ -18,7 +18,7 @@ COMPARABLE = 0.3
 """Minimum decrease in the sum of squares, as a fraction of the largest, for other numbers of cycles to be tried too."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of a motion that diverges with coarse steps
+@np.errstate(over="ignore", invalid="ignore")  # if the motion diverges with coarse steps
 def wave_peaks(
     period: SettledPeriod,
     estimate: Estimate,

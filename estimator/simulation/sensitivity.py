@@ -68,7 +68,7 @@ NOWHERE = AT_ONCE * math.ceil(len(CAUSES) / AT_ONCE)  # column for unwanted deri
 WIDE = NOWHERE + AT_ONCE
 # Rows of each step, with causes as columns: f1, f2, slope_1, slope_2, m11, m12, m22 of stage 1, then of stage 2.
 STAGE = 7 * WIDE
-SLOPES, MASSES = 2 * WIDE, 4 * WIDE  # from the stage's first row
+SLOPES, MASSES = 2 * WIDE, 4 * WIDE  # offsets from the stage's first row
 # Scalars of each step. For each stage, derivatives with respect to the state: f1 and f2 to q1, q2, v1, v2; slope_1 to
 # q1, v1; slope_2 to q2, v2; m11 and m12 to q2. Then scalars common to all parameters, see `arm_step`.
 BY_STATE = 14
@@ -441,8 +441,8 @@ def _loop(
 
 
 # Only the loop is called from Python; wrappers for the others would take another second to compile. Calls that are not
-# inlined would spend more time on counting references to arrays than on arithmetic. None of this allocates, and code
-# without such counts is compiled a fifth faster.
+# inlined would spend more time on counting references to arrays than on arithmetic. None of these functions allocates
+# memory, so they do without such counts; this also makes compilation a fifth faster.
 fused = partial(embedded, fastmath={"contract"}, forceinline=True, _nrt=False)
 _drive, _arm, arm_step, follow = map(fused, (_drive, _arm, arm_step, follow))
 _advance: Callable[..., None] = compiled(_loop, fastmath={"contract"}, _nrt=False)

@@ -140,9 +140,9 @@ def setup(
     yes: Annotated[bool, typer.Option("--yes", help="Answer yes to every question.")] = False,
     json_only: Json = False,
 ) -> None:
-    """Set a servo's ID, baud rate, return delay or Secondary ID. Asks before each write and reads each value back.
+    """Set a servo's ID, baud rate, return delay or Secondary ID. Each write requires confirmation and is read back.
 
-    First restores all servos on this port that a killed run left with torque on or with that run's settings.
+    All servos on this port that a killed run left with torque on, or with its settings, are restored first.
     """
     from hil.cli.views.question import agrees
     from hil.cli.views.setup_view import changed, print_changes

@@ -17,7 +17,7 @@ def init(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Ask no questions; accept every default.")] = False,
 ) -> None:
-    """Scan the bus, ask for further data, and write a commented TOML file. Torque stays off; no setting is changed."""
+    """Scan the bus, ask about the arm, and write a commented TOML file. Torque stays off; no setting is changed."""
     from hil.cli.terminal import Terminal
     from hil.cli.views.question import answer
     from hil.config.fake_url import url_for

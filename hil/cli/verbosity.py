@@ -61,4 +61,4 @@ def _set_up(verbose: int, quiet: bool) -> None:
 
 
 class _ShownOnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
-    """Writes to standard error until the next command that runs in the same process replaces it."""
+    """A log handler for standard error; the next command that runs in the same process replaces it."""

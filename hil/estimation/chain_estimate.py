@@ -264,8 +264,8 @@ def about_zeros(config: Config, estimate: ChainEstimate) -> str:
     held = "The encoder zeros were taken from the configuration and not identified"
     if not estimate.doubtful_zeros:
         return (
-            f"{held}: a zero error that this motion does not reveal makes the link parameters wrong, although the "
-            "torques are correct. Use `hil pose` to check the angles by hand."
+            f"{held}: if they contain an error that this motion does not reveal, the link parameters are wrong even "
+            "though the torques are correct. Use `hil pose` to check the angles by hand."
         )
     off = ", ".join(
         f"{config.joints[joint - 1].name} is off by about {by:.2g} rad" for joint, by in estimate.doubtful_zeros
@@ -305,7 +305,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
         return f"{said} nothing remains unexplained."
     causes = (
         "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time, joints "
-        "whose position or axis differs from the description or whose direction is wrong (direction)"
+        "whose position or axis differs from the description, or whose key `direction` is wrong"
     )
     if not estimate.model.base_tilt and np.any(estimate.model.base.chain.gravity):
         causes = f"a base that is not level ([model] base_tilt = true identifies it), {causes}"
@@ -321,6 +321,6 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
         return f"{said} the model is incomplete.{tried} Possible causes: {causes}."
     return (
         f"{said} but part of it repeats with the motion. This increases standard errors by a factor of up to "
-        f"{estimate.systematic:.1f}, and some values may be wrong by more than their standard errors. A small effect "
-        f"is missing from the model: {causes}.{tried}"
+        f"{estimate.systematic:.1f}, and some values may be wrong by more than their standard errors. The model "
+        f"lacks a small effect. Possible causes: {causes}.{tried}"
     )

@@ -9,7 +9,7 @@ from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 from hil.estimator.arrays import Array
 
-REACHED = 0.5  # fraction of a limit, below which something else limited the torque
+REACHED = 0.5  # if a smaller fraction of every limit was reached, something else limited the torque
 
 
 def torque_limit(config: Config, samples: NDArray[np.void], index: int | None = None) -> str:

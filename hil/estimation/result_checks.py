@@ -23,7 +23,10 @@ def describe_validation(
     held_out: Array | None,
     held_out_as_fitted: Array | None = None,
 ) -> Validation:
-    """Convert a validation. held_out, held_out_as_fitted: as in `hil.estimator.selection.verdict.Evidence`."""
+    """Convert a validation to the form stored in a result.
+
+    held_out, held_out_as_fitted: as in `hil.estimator.selection.verdict.Evidence`.
+    """
     first, second, correlation = found.confounded
     levels, lines = found.levels, found.levels.lines
     return Validation(
@@ -88,7 +91,7 @@ def describe_segment_choice(choice: unsettled.SegmentChoice) -> ModelChoice:
 
 
 def describe_chain_choice(choice: ChainChoice) -> ModelChoice:
-    """Convert the choice among models of a spatial arm (by one-step predictions of the fitted motion)."""
+    """Convert the choice among models of a spatial arm (by one-step predictions) to the form stored in a result."""
     return ModelChoice(
         chosen=choice.estimate.model.description,
         error_divided_by=choice.gained,

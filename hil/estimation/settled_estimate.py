@@ -140,7 +140,7 @@ def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tup
         return settled_period(config, facts, samples, HELD_OUT), []
     except RecordingCutShort:
         return None, [
-            "The recording ends before the held-out motion settled, so the prediction of another motion is not "
+            "The recording ended before the held-out motion had settled, so the prediction of another motion was not "
             "validated. Identify again to validate it."
         ]
 

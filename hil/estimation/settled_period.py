@@ -21,7 +21,7 @@ from hil.runs.run_folder import RunFacts
 
 _AROUND_S, _FEWEST_AROUND = 0.04, 4
 """A sample's velocity is determined from the readings within this time [s] on each side of it, or from this many
-readings on each side if those are fewer.
+readings on each side if fewer lie within that time.
 """
 
 

@@ -11,8 +11,8 @@ from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
 
 LEAST_SWING = 30.0  # encoder steps
-LOST = 0.005  # fraction of the samples
-LATE = 0.25  # fraction of the interval: a later write disturbs the motion noticeably
+LOST = 0.005  # fraction of unusable samples above which a warning is given
+LATE = 0.25  # fraction of the interval; a write that is later than this disturbs the motion noticeably
 BY_LATENESS = 0.3  # ratio of late to lost samples above which the computer is the likely cause
 
 

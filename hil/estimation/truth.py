@@ -85,7 +85,7 @@ def truth_of(result: Result, config: Config) -> Truth:
 
 
 def scaled(truth: Mapping[str, float] | None, config: Config, extra: Mapping[str, Quantity]) -> dict[str, float] | None:
-    """Return `truth` scaled like a result's parameters, for the result's `truth_scaled`; None if nothing changes."""
+    """Return `truth` in the scale of a result's parameters, for its `truth_scaled`; None if that changes nothing."""
     found = in_file_unit(truth or {}, config, extra, len(config.joints))
     return found.values if found.note else None
 

@@ -24,7 +24,7 @@ from hil.recordings.velocity import notes as velocity_notes
 
 Values = NDArray[np.float64]
 
-SMALLEST_STEP = 1e-9  # rad, for readings without visible steps, whose noise is measured instead
+SMALLEST_STEP = 1e-9  # rad; for readings without visible steps, whose noise is measured instead
 
 
 @dataclass(frozen=True)

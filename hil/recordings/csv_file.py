@@ -133,7 +133,7 @@ def _are_units(fields: list[str]) -> bool:
 
 
 def _numbers(fields: list[str], decimal_comma: bool) -> Values:
-    # Python reads 1_000 as a number; whoever wrote it may have meant something else. Larger values are not measured.
+    # Python reads 1_000 as a number, but its author may have meant something else. No measured value exceeds _LARGEST.
     with suppress(ValueError):
         if "_" not in "".join(fields):
             values = np.array(fields, dtype=np.float64)

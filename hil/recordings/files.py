@@ -23,7 +23,7 @@ def is_recording(path: Path) -> bool:
 
 
 def read_tables(path: Path) -> list[Table]:
-    """Read the tables in one file or folder. Raises CsvError, whose message names that file or folder."""
+    """Read the tables in one file or folder. Raises CsvError; its message names that file or folder."""
     if not path.exists():
         raise CsvError(f"{path} cannot be read: No such file or directory.")
     if path.is_dir():

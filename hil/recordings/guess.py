@@ -1,4 +1,4 @@
-"""Guesses the meaning of columns from their names, if [columns] does not specify it."""
+"""Guess the meaning of columns from their names, if [columns] does not specify it."""
 
 import json
 import re
@@ -27,7 +27,7 @@ _OF_UNIT = {
     "voltage": {"V", "mV"},
     "pwm": {"%"},
 }
-# Not a measurement of the joint, or not of its angle.
+# Names of columns that do not hold measurements of a joint, or not of its angle.
 _NOT_MEASURED = re.compile(
     r"(?<![a-z])(des|desired|ref|reference|goal|target|sp|setpoint|cmd|commanded|sim|est)(?![a-z])", re.I
 )
@@ -35,7 +35,7 @@ _NOT_POSITION = re.compile(
     r"(?<![a-z])(vel|qvel|velocity|speed|acc|qacc|accel|dq|qd|qdd|ddq|temp|temperature|err|error)(?![a-z])", re.I
 )
 _LENGTHS = ("mm", "cm", "m", "in", "inch")
-_EXAMPLE = 5  # columns of a recording of two joints
+_EXAMPLE = 5  # number of columns in a recording of two joints
 _SUPPLY = re.compile(r"(?<![a-z])(supply|battery|bus|input)(?![a-z])", re.I)
 
 

@@ -100,7 +100,7 @@ def _from_text(name: str, texts: list[str | None]) -> dict[str, Values]:
 
 
 def _labels(feature: dict[str, Any], size: int) -> list[str]:
-    """Names of a vector's entries, possibly under a key such as "motors"."""
+    """Names of a vector's entries, which may be stored under a key such as "motors"."""
     names = feature.get("names")
     if isinstance(names, dict):
         names = next((each for each in names.values() if isinstance(each, list)), None)

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 
-EVEN = 0.02  # of an interval: largest deviation of the sample times from equal spacing
-SHORTEST = 64  # samples in a period
-SAME_TORQUE = 1e-3  # RMS difference over the torque's RMS
-SAME_MOTION = 0.02  # RMS difference over the motion's RMS, as in the settling criterion of `hil identify`
+EVEN = 0.02  # largest deviation of the sample times from equal spacing, as a fraction of an interval
+SHORTEST = 64  # minimum number of samples in a period
+SAME_TORQUE = 1e-3  # largest RMS difference, relative to the torque's RMS
+SAME_MOTION = 0.02  # largest RMS difference, relative to the motion's RMS; as in the settling of `hil identify`
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,8 @@ def split_head(head: str) -> tuple[str, str | None]:
 def wrapped(values: NDArray[np.float64], sizes: Sequence[int]) -> int | None:
     """The size [bits] of a signed register that was read as an unsigned number; None if nothing indicates this.
 
-    In that case, negative values appear in the uppermost quarter of the range, and the two middle quarters are empty.
+    After such a misreading, negative values appear in the uppermost quarter of the range, and the two middle quarters
+    are empty.
     """
     known = values[np.isfinite(values)]
     if not known.size or known.min() < 0.0 or (known != np.round(known)).any():

@@ -1,4 +1,4 @@
-"""Excitation of a chain by paths that are finite Fourier series of the joint angles.
+"""Excitation of a chain by paths whose joint angles are finite Fourier series.
 
 The arm is driven with the torque that an approximate model requires for the path, plus that of a software spring and
 damper. The series is optimised for the intended use of the result: predicting the torque of other motions in the same
@@ -24,11 +24,11 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.fourier import PeriodicMotion
 from hil.estimator.errors import ExcitationError
 
-CANDIDATES = 24  # random initial paths
-IMPROVEMENTS = 96  # random changes of the best path that are tried
+CANDIDATES = 24  # number of random initial paths
+IMPROVEMENTS = 96  # number of random changes to the best path to try
 CHANGE, LEAST_CHANGE = 0.5, 0.1  # first and last size of a change, relative to the path's coefficients
-STEEPEST = 2.0  # largest power of the harmonic's number by which random coefficients decrease
-OTHERS = 3  # random motions whose torque is to be predicted
+STEEPEST = 2.0  # largest exponent with which random coefficients decrease with the harmonic's number
+OTHERS = 3  # number of random motions whose torque is to be predicted
 CHANGED = 0.3  # fraction of the coefficients changed at a time
 SAMPLES_PER_HARMONIC = 12
 NOISE = 4.4e-4  # rad: standard deviation of an angle rounded to 4096 steps per turn

@@ -25,7 +25,7 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.errors import ExcitationError
 from hil.estimator.progress import Tell, counted
 
-LOOKED_AT = 120  # samples at which a variation is evaluated
+LOOKED_AT = 120  # number of samples at which a variation is evaluated
 NOISE = 0.02  # assumed residual of a regression, relative to a joint's RMS torque, friction included
 SLOW = 0.1  # rad/s: width of the smoothed Coulomb step
 CENTRES = 48
@@ -34,7 +34,7 @@ OFFSPRING, PARENTS = 20, 6
 GENERATIONS = 60
 FIRST_STEP, FASTER, SLOWER = 0.3, 1.1, 0.9
 SHRINKS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
-SWING_SHARE = 0.9  # fraction of the distance from a centre to the nearer limit
+SWING_SHARE = 0.9  # swing of a path, as a fraction of the distance from its centre to the nearer limit
 LEAST_SWING_SHARE = 0.15
 _MEAN_SHARE = 0.1  # weight of the mean log error in the criterion; the log of the largest has the remaining weight
 

@@ -45,11 +45,11 @@ SHAPES = {
 }
 """Priors on the shape of friction and on drives: typical value [in its unit] and standard deviation of its logarithm.
 
-Early in a fit, these parameters are held fixed: a lag driven to zero while other errors dominate would hardly recover.
+Early in a fit, these parameters are held fixed: if other errors drove a lag to zero, it would hardly recover.
 """
 ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
 """Priors on small angles that gravity may not reveal: standard deviations around zero [rad]."""
-RESHAPING = 1.0  # maximum change of their logarithms in one step
+RESHAPING = 1.0  # maximum change of a friction-shape parameter's logarithm in one step
 NARROWING, WIDENING = 1.6, 1.1  # maximum decrease and increase in a width's logarithm in one step
 LONGEST = 2.0  # maximum change of any coordinate in one step
 

@@ -25,7 +25,7 @@ from hil.estimator.options import MinimiserOptions
 from hil.estimator.simulation.drive import torque_and_slopes
 
 MINIMISER = MinimiserOptions()
-MOST_KEPT = 1 << 26  # bytes of derivatives
+MOST_KEPT = 1 << 26  # maximum size of the stored derivatives [bytes]
 
 
 @dataclass
@@ -70,13 +70,14 @@ class ChainProblem:
     only if `steps` is 1.
     """
     reach: float = 1.0
-    """Fraction of their maximum change per step that friction-shape parameters may use; smaller near the minimum."""
+    """Fraction of the maximum change per step that friction-shape parameters may use; smaller near the minimum."""
     prior_weight: float = 1.0
     """Factor on the prior's precision. It exceeds 1 while model errors exceed the noise that the weights assume, so
     that the prior still decides what the data do not determine.
     """
     added: tuple[Array | None, ...] = ()
-    """Base parameters of the known mass added in each period (base parameters,) [SI]; None if none was added."""
+    """Change in the base parameters due to the known mass in each period (base parameters,) [SI]; None without a mass.
+    """
     latest: _Latest = field(repr=False, compare=False, default_factory=_Latest)
 
     @property
@@ -120,7 +121,7 @@ class ChainProblem:
         return np.ascontiguousarray(of_steps)
 
     def gain(self, period: SettledPeriod) -> Array:
-        """Return the gains of the critically damped observer (2, joints) [1, 1/s] per sample."""
+        """Return the critically damped observer's gains per sample (2, joints) [1, 1/s]."""
         turn = 2.0 * np.pi * self.softness
         gains = np.array([2.0 * turn, turn * turn]) * self.every / period.rate
         return np.repeat(gains[:, None], period.joints, axis=1)
@@ -208,7 +209,7 @@ class ChainProblem:
         return self._add_prior(x, np.zeros((x.size, x.size)), np.zeros(x.size))
 
     def cost(self, x: Array) -> float:
-        """Return only the sum of squares at `x`; infinite if the motion diverges."""
+        """Return the sum of squares at `x` without its normal equations; infinite if the motion diverges."""
         total = self.prior_cost(x)
         for position, period, weight in zip(self._motions(x), self.periods, self.weights, strict=True):
             if position is None:

@@ -15,13 +15,12 @@ class ChainOptions:
     A softer observer extracts more information; one that is too soft no longer follows the motion.
     """
     lost: float = 1.5
-    """A softer observer is rejected if the cost grows by more than this factor times the growth expected from its
-    softness.
+    """A softer observer is rejected if the growth in cost exceeds this multiple of what its softness alone would cause.
     """
     first_step: float = 5.2e-3
     """Integration step while the observer is stiff [s]; samples within such a step are skipped."""
     coarse_step: float = 2.6e-3
-    """Integration step of the earlier iterations to which `first_step` does not apply [s]."""
+    """Integration step of the iterations between the first ones (`first_step`) and the last ones (`fine_step`) [s]."""
     fine_step: float = 1.3e-3
     """Integration step of the last iterations [s]."""
     finer: int = 16
@@ -47,7 +46,7 @@ class ChainOptions:
     min_initial_lag: float = 5e-4
     """Minimum initial guess of the lag [s]."""
     reach: float = 0.3
-    """Fraction of their maximum change per step that friction-shape parameters may use in the last iterations.
+    """Fraction of the maximum change per step that friction-shape parameters may use in the last iterations.
 
     The sum of squares is far from quadratic in these parameters.
     """

@@ -13,7 +13,7 @@ from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.model.dynamics import mass_matrix
 from hil.estimator.chain.model.late_torque import as_moving
 
-POSES = 40  # of a recording, at which the joints' inertias are computed
+POSES = 40  # number of poses of a recording in which the joints' inertias are computed
 
 
 def resolved_widths(problem: ChainProblem, x: Array, shortest_step: float, widths_per_substep: float) -> Array:

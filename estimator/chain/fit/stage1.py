@@ -16,7 +16,7 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.fourier import Lines, PeriodicMotion, cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 
-COULOMB_WIDTH = 0.05  # rad/s: about the velocity error of a sticking joint due to the omitted Fourier lines
+COULOMB_WIDTH = 0.05  # rad/s: roughly the velocity error of a sticking joint that results from omitting Fourier lines
 PASSES = 3
 
 
@@ -41,8 +41,8 @@ def fit_lines(
 ) -> ChainLinear:
     """From settled periods, estimate the parameters in which the torque is linear.
 
-    added: base parameters of the known mass added to the arm in each period (base parameters,) [SI]; None if none was
-    added.
+    added: change in the base parameters due to the known mass in each period (base parameters,) [SI]; None without a
+    mass.
     """
     lines = [lines_of(period.filled()) for period in periods]
     highest = list(map(cut_off, lines))

@@ -130,8 +130,8 @@ def fit_periods(
     )
     last = replace(sticking, weights=weights, steps=problem.steps, finer=options.finest, reach=options.reach)
     damped = last.minimise(nearer.x, options.ftol, options=LAST)
-    # Damping holds back poorly determined coordinates, so it is removed now. Without damping from the beginning, many
-    # coordinates would have reached their step limits and held up the others.
+    # Damping holds back poorly determined coordinates, so it is removed now. Had it been absent from the beginning,
+    # many coordinates would have reached their step limits and held up the others.
     minimum = damped
     if not damped.stalled:
         minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
@@ -171,7 +171,7 @@ def _fit(
     structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
     white = robust_covariance(minimum.at, None, samples, count)
     covariance = coloured_covariance(problem, x, minimum.at.normal)[:count, :count]
-    if structured > 0.0:  # a model error repeats itself, and its size may vary over time
+    if structured > 0.0:  # model errors recur, and their size may vary over time
         robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
         covariance = _larger(covariance, robust)
     step, decrease = remaining(minimum, problem.coordinates)

@@ -171,7 +171,7 @@ def softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Arr
         every = 1 if last or coarse.steps > 1 else skip
         trial = replace(coarse, softness=frequency, every=every)
         growth = options.lost * (softness / frequency) ** 2
-        # The subsequent fits start with this observer, so no fit is needed here to show that it is good enough.
+        # If this observer is good enough, no fit is needed here, since the subsequent fits start with it.
         if last and cost is not None and _of_data(trial, x) <= growth * (cost + x.size):
             return x, frequency, spent
         try:

@@ -5,10 +5,10 @@ that determine the parameters. The noise at these low frequencies is estimated f
 absorbs the fraction h(f) of the noise, the leverage of its Jacobian, so the power of the residual is that of the noise
 times 1 - h. The noise level of a joint is the mean over frequencies weighted by leverage; for model errors, which are
 slow, it is far above that of white noise. Since short recordings have few degrees of freedom, each level is shrunk
-towards the mean level of all joints, and this mean towards the level of white noise. The level is also used for
-frequencies at which the fit absorbs nearly all noise and the residual reveals none: the observer suppresses the slow
-part of the rounding errors, so their power there is no larger than at higher frequencies. The covariance is the
-sandwich N^-1 S N^-1, where S sums the information of each frequency times the noise there.
+towards the mean level of all joints, and this mean towards the level of white noise. The same level is assumed at
+frequencies where the fit absorbs nearly all noise, so that the residual does not reveal it. There, the power of
+rounding errors is no larger than at higher frequencies, since the observer suppresses their slow part. The covariance
+is the sandwich N^-1 S N^-1, where S sums the information of each frequency times the noise there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,8 +24,8 @@ from hil.estimator.chain.fit.resolved_widths import free_inertias
 from hil.estimator.chain.model.late_torque import lost_inertia, rotor
 from hil.estimator.simulation.back_emf import neglected_inertia
 
-MOST_SAMPLES = 1 << 13  # of a period: enough to estimate a noise level to within a tenth
-SUPPOSED = 10.0  # degrees of freedom assigned to white noise in the common level, and to that level in each joint's
+MOST_SAMPLES = 1 << 13  # number of a period's samples to use; enough to estimate a noise level to within 10 %
+SUPPOSED = 10.0  # degrees of freedom of the white level in the common level, and of the common level in each joint's
 
 
 def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array:

@@ -20,7 +20,7 @@ from hil.estimator.chain.model.dynamics import TERMS, Columns, regressor
 from hil.estimator.chain.model.geometry import Chain, parameter_names, unit_of
 from hil.estimator.chain.model.tilt import GENERIC, tilted
 
-ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, inertias, armature, mass
+ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # order of a link's parameters: moments, inertias, armature, mass
 SAMPLES = 150
 KINDS = (slice(1, 4), slice(4, 10), slice(10, 11), slice(0, 1))  # moments, inertias, armature, mass
 CLEARLY_INDEPENDENT = 0.1
@@ -35,7 +35,7 @@ INDEPENDENT = 2e-3
 Rounded angles such as 1.57 or 1.5708 in a description give every parameter a tiny separate effect. No recording could
 determine a parameter from such an effect.
 """
-LEAST_FACTOR = 1e-7  # of a group
+LEAST_FACTOR = 1e-7  # smaller factors in a sum are taken as 0
 NOTHING = 1e-9
 
 

@@ -358,8 +358,8 @@ def invert(matrix: Any, inverse: Any, factor: Any) -> bool:  # noqa: PLR0912
     return True
 
 
-# Functions called only from compiled code need no wrappers for C. The large ones are part of several loops and cached,
-# so that a program that needs another of these loops later does not compile them again.
+# Functions called only from compiled code need no wrappers for C. The large ones are used by several loops and are
+# cached, so that a program that later needs another of these loops does not compile them again.
 _PLAIN: dict[str, Any] = {"fastmath": {"contract"}, "_nrt": False}
 _inner = partial(embedded, **_PLAIN)
 _cross, _dot, _push, _carry, _flow, _into = map(_inner, (_cross, _dot, _push, _carry, _flow, _into))

@@ -3,7 +3,7 @@
 The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
 product of back-EMF and lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due
 to back-EMF. The lag of a winding cancels at most half of a joint's inertia, namely when the poles of the equivalent
-motor coincide. Far from a fit's minimum, the computed loss may be greater; it is limited to this value.
+motor coincide. Far from a fit's minimum, the computed loss may be greater; it is then limited to that half.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,11 +18,13 @@ from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 MEANINGS = {"lag_ratio": "ratio of the lag of the joint's current loop to that of joint 1"}
 """Descriptions of the kinds of parameters that only chains have."""
 PART = 0.1
-"""`limited` names a joint's back-EMF if it causes more than this fraction of the largest inertia loss in any motion."""
+"""A joint's back-EMF is named by `limited` if it causes more than this fraction of the largest inertia loss in any
+motion.
+"""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
-_ARMATURE = 10  # of a link's parameters
-_POSES = np.random.default_rng(4).uniform(-np.pi, np.pi, (6, 7))  # in which inertias are compared (poses, joints)
+_ARMATURE = 10  # index among a link's parameters
+_POSES = np.random.default_rng(4).uniform(-np.pi, np.pi, (6, 7))  # poses in which inertias are compared (poses, joints)
 
 
 def lags_of(parameters: Mapping[str, float], joints: int) -> Array:
@@ -151,7 +153,7 @@ def _most_lost(
     largest, parts = 0.0, np.zeros_like(lost)
     for pose in _POSES[:, : base.chain.joints]:
         mass = mass_matrix(base.chain, every, pose)
-        if np.all(np.isfinite(mass)) and linalg.eigvalsh(mass)[0] > 0.0:  # otherwise it cannot be simulated anyway
+        if np.all(np.isfinite(mass)) and linalg.eigvalsh(mass)[0] > 0.0:  # other arms cannot be simulated anyway
             fractions, motions = linalg.eigh(root[:, None] * linalg.inv(mass) * root)
             if fractions[-1] > largest:
                 largest, parts = float(fractions[-1]), np.square(motions[:, -1])

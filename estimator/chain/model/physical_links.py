@@ -19,7 +19,7 @@ from hil.estimator.chain.model.dynamics import TERMS
 PULL = 0.03  # weight of a unit change in a coordinate, relative to one standard error of a base parameter
 LEAST_MASS = 1e-4  # kg
 LEAST_SPREAD = 1e-3  # m: minimum radius of gyration, for links described as point masses
-STEP = 1e-4  # of the central differences, relative to a coordinate's typical step
+STEP = 1e-4  # step of the central differences, relative to a coordinate's typical step
 LEAST_ROTOR = 1e-7  # kg m^2
 _UPPER = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 

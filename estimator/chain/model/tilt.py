@@ -15,7 +15,7 @@ TILT = ("base_tilt_x", "base_tilt_y")
 MEANINGS = {name: f"tilt of the base: rotation about its {name[-1]} axis" for name in TILT}
 
 GENERIC = 0.5, -0.4  # rad: angles at which gravity is not aligned with any axis
-_STEP = 1e-6  # rad, of the differences
+_STEP = 1e-6  # rad; step of the differences
 
 
 def tilt_axes(gravity: Array) -> Array:

@@ -38,7 +38,7 @@ STATIC = 1.5  # ratio of static to Coulomb friction
 MOSTLY = 0.5  # filtered indicator of standstill above which a joint counts as standing still
 STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
 VISIBLE_RAD_S = 0.027  # smallest velocity that certainly shows in the velocity register
-CERTAIN = 2.0  # standard deviations to subtract from an estimated torque so that the rest certainly acts
+CERTAIN = 2.0  # standard deviations to subtract from an estimated torque so that the remainder certainly acts
 VELOCITY_STD = 0.0135  # rad/s: resolution of the register, plus noise
 NOISE_S = 1.0
 CLIPPED = 9.0
@@ -257,7 +257,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         distance = _look_at_rest(rests[j], q[j], stands, memory[TORQUE, j], row, theta)
         if distance != 0.0:
             variance = 2.0 * quiet * quiet * memory[NOISE, j]
-            if abs(distance) > 2.0 * static:  # otherwise it makes no difference and would only cost time
+            if abs(distance) > 2.0 * static:  # otherwise it cannot matter and would only take time to compute
                 variance += _variance(rests[j], distance, row, covariance)
             tolerance = max(TIMES * math.sqrt(variance), quiet * floor)
             momentum = VISIBLE_RAD_S * abs(_own_inertia(rooms, column, theta, base, j))

@@ -12,21 +12,22 @@ from hil.estimator.simulation.arm import steps_per_sample
 from hil.estimator.simulation.closed_loop import Feedback
 
 PERIODS = 3  # number of periods simulated, of which the last is used
-FINER = 4  # smaller integration steps that replace one near standstill
+FINER = 4  # number of smaller integration steps that replace one step near standstill
 NEVER = 1e6  # N m: a torque limit that is never reached
 
 
 def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeriod) -> Array:
     """Predict the joint angles (joints, samples) [rad] of a settled period under its commands and its feedback.
 
-    The simulation starts at rest at the first measured position and continues until the transient has decayed. Raises
-    PeriodicityError if the motion diverges.
+    The simulation starts at rest at the first measured position and lasts for PERIODS periods, so that the transient
+    decays. Raises PeriodicityError if the motion diverges.
     """
     joints, samples = period.joints, period.samples
     excitation, feedback = _commands(period)
     steps = steps_per_sample(period.rate)
     step = 1.0 / (period.rate * steps)
-    # Commands take effect `command_to_sample` before the sample of their index, plus `delay`; lumped into a lag.
+    # The delay is lumped into the lag, less `command_to_sample`, by which commands act before the samples of the same
+    # index.
     late = lags_of(parameters, joints) + parameters.get("delay", 0.0) - period.command_to_sample
     lag = np.maximum(late, 1e-5)
     fallen = 1.0 - np.exp(-step / lag)

@@ -22,10 +22,10 @@ from hil.estimator.compiled import compiled
 
 LONGEST_STEP = 1.3e-3  # s
 RAN_AWAY = 1e3  # rad/s
-NEAR_REST = 0.2  # rad: distance from the rest pose within which the surface under it may support the arm
+NEAR_REST = 0.2  # rad: distance from the rest pose within which the surface may support the arm
 YIELDS = 0.03  # rad: how far that surface gives way under a joint's largest torque
 STOP_YIELDS = 0.01  # rad: how far a joint's own end stop gives way under its largest torque
-PRESSED_SHARE = 0.03  # of a joint's largest torque: a smaller gravity torque does not press a joint against the surface
+PRESSED_SHARE = 0.03  # of a joint's largest torque; less gravity torque does not press the joint against the surface
 VISCOUS, COULOMB, OFFSET, WIDTH, SCALE, LAG = range(6)
 DRIVE_TERMS = ("viscous", "coulomb", "offset", "coulomb_width", "torque_scale", "lag")
 
@@ -91,7 +91,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Pull:
-    """Torque that grows while a joint is off its path, so that friction and unknown weights cannot keep it there.
+    """Torque that grows while a joint is off its path, so that friction and unknown weights cannot keep it off.
 
     path: positions (samples, joints) [rad]. per_second: growth relative to the spring's torque [1/s]. share: maximum of
     this torque, as a fraction of the joint's largest torque.
@@ -146,7 +146,7 @@ def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = No
 def _pull_of(loop: Loop) -> tuple[Array, Array, Array]:
     """Return the path (samples, joints), the growth per sample and rad (joints,), and the maximum (joints,).
 
-    The path is empty if there is no such torque.
+    The path is empty if `loop.pull` is None.
     """
     if loop.pull is None:
         return np.empty((0, len(loop.limit))), np.zeros_like(loop.limit), np.zeros_like(loop.limit)

@@ -37,7 +37,7 @@ class ChainRun:
     """Number of smaller steps into which an integration step is divided if a joint may be near standstill during it."""
 
 
-PIECE = 256  # samples whose derivatives fit into the processor's cache
+PIECE = 256  # number of samples whose derivatives fit into the processor's cache
 
 
 class Simulation:

@@ -32,8 +32,8 @@ JOINT_TERMS = (
     *("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
     *("torque_scale", "zero"),
 )
-NEAR = 6.0  # distance from standstill within which steps may be divided, in widths of friction's step
-CROSSED = 1.0  # number of such widths that a joint may cross in one step
+NEAR = 6.0  # distance from standstill within which steps may be divided, in widths of the Coulomb step
+CROSSED = 1.0  # number of these widths that a joint may cross in one step
 WORST = 1e4  # rad or rad/s: a simulation that reaches this has diverged
 
 
@@ -354,8 +354,8 @@ def _run_loop(  # noqa: PLR0912
     return True
 
 
-# Only the loop is called from Python. None of this allocates: without numba's reference counts, which cost an atomic
-# operation for every view of an array, it is a quarter faster.
+# Only the loop is called from Python. None of these functions allocates memory, so they need no reference counts, which
+# in numba cost an atomic operation for every view of an array; without them, the code is a quarter faster.
 _inner = partial(embedded, fastmath={"contract"}, _nrt=False)
 _left, _direct, _add_eight, _add_four, _multiply, _solve_for, _stage, _follow, _pieces, _broken = map(
     _inner, (_left, _direct, _add_eight, _add_four, _multiply, _solve_for, _stage, _follow, _pieces, _broken)

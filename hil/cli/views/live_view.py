@@ -12,9 +12,9 @@ from hil.config.schema import Config
 from hil.experiment.stream import Progress
 
 _NEAR = 0.85  # fraction of a limit above which a value is shown in yellow
-_WIDEST, _NARROWEST = 22, 8  # columns of a gauge
-_TOLD_IN_FULL = 60  # smallest number of columns in which the timing is shown in full
-_VALUE, _LIMITS, _HEALTH = 7, 12, 14  # columns of a value, of a gauge's two limits, of temperature and voltage
+_WIDEST, _NARROWEST = 22, 8  # largest and smallest width of a gauge, in columns
+_TOLD_IN_FULL = 60  # minimum number of columns for showing the timing in full
+_VALUE, _LIMITS, _HEALTH = 7, 12, 14  # widths [columns]: a value, a gauge's two limits, temperature and voltage
 
 
 @dataclass(frozen=True)

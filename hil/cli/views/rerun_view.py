@@ -48,7 +48,7 @@ def rerun_view(live: str, config_path: Path) -> Iterator[OnProgress]:
 
 
 def _open(recording: Any, place: str) -> None:
-    """Send the recording to the file or URL `place`; if it is empty, start a viewer."""
+    """Send the recording to the file or URL `place`; if `place` is empty, start a viewer."""
     if "://" in place:
         recording.connect_grpc(place)
     elif place:

@@ -160,7 +160,7 @@ def _times(ratio: float | None) -> str:
         return "not comparable"
     if abs(ratio - 1.0) < _ALIKE:
         return "about the same"
-    return f"{ratio:.3g} times larger" if ratio > 1.0 else f"{1.0 / ratio:.3g} times smaller"
+    return f"larger by a factor of {ratio:.3g}" if ratio > 1.0 else f"smaller by a factor of {1.0 / ratio:.3g}"
 
 
 def _verdict(result: SettledResult) -> list[str]:

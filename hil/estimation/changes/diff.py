@@ -140,7 +140,7 @@ def diff_models(
     least_share: float = LEAST_SHARE,
     friction: Sequence[FrictionChange] = (),
 ) -> Difference:
-    """Compare two models of one arm parameter by parameter, in the order of the first."""
+    """Compare two models of one arm, parameter by parameter, in the order of the first model."""
     periods = ("ripple_cycles", "cogging_cycles")
     common = [name for name in before.values if name in after.values and not name.startswith(periods)]
     z = {name: _z(before, after, name) for name in common}

@@ -24,8 +24,8 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.stage1 import LinearEstimate, fit_lines
 
 STEPS = 2  # integration steps per sample
-WITHIN = 0.5  # relative error of the initial guess
-BOUNDS = (0.02, 20.0)  # relative to `centre`; offsets may have either sign
+WITHIN = 0.5  # maximum relative error of the initial guess
+BOUNDS = (0.02, 20.0)  # bounds relative to `centre`; offsets may have either sign
 
 
 def import_mujoco() -> tuple[Any, Any]:

@@ -145,7 +145,7 @@ def _other(name: str, goal: Array, measured: Array, margin: float) -> str:
     if part > OFTEN and _follows_small_goals(goal, measured) < SHORT:
         return (
             f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
-            f"high-torque samples, and equally little at low torque, where nothing clips it: {why}"
+            f"high-torque samples, and just as little at low torque, where nothing clips it: {why}"
         )
     return ""
 
@@ -163,9 +163,10 @@ def _clipped(name: str, goal: Array, measured: Array, margin: float, lower: str)
 
 
 def _least(goal: Array) -> Array:
-    """The smaller of two successive goals; the motor has had time to reach it. 0 if the goals differ in sign.
+    """The smaller magnitude of two successive goals, which the motor has had time to reach; 0 if the signs differ.
 
-    A sample's current is the response to the goal of the sample before it, and a lagging current loop is not clipping.
+    A sample's current responds to the previous sample's goal, and a current loop that merely lags must not count as
+    clipping.
     """
     return np.asarray(np.minimum(np.abs(goal[1:]), np.abs(goal[:-1])) * (goal[1:] * goal[:-1] > 0.0))
 

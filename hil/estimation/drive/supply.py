@@ -21,12 +21,12 @@ from hil.estimator.arrays import Array, Mask
 
 FEWEST = 40
 """Minimum number of voltage readings."""
-STEP_V = 0.1  # of the register
+STEP_V = 0.1  # resolution of the register
 SIGNIFICANT = 6.0
 """Number of standard errors by which the drop at full load must differ from zero."""
 LEAST = {Mode.PWM: 0.005, Mode.CURRENT: 0.05}
 """Smallest drop that is reported, relative to the no-load voltage, by drive mode."""
-_FULL_LOAD = 0.99  # quantile of the drop
+_FULL_LOAD = 0.99  # quantile of the drop that counts as the drop at full load
 
 
 @dataclass(frozen=True)

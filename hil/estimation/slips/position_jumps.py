@@ -12,11 +12,11 @@ from hil.estimator.arrays import Array
 from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
 
-LEAST_STEPS = 8.0  # encoder steps, smallest jump that is reported
+LEAST_STEPS = 8.0  # smallest jump that is reported, in encoder steps
 USUAL_QUANTILE = 0.995
-FAR_OUTSIDE = 4.0  # multiple of the usual difference
-AROUND_S = 0.03  # s on either side, within which a delayed or filtered velocity catches up with a real motion
-KEPT = 0.6  # fraction of a jump that remains after that time; less is one bad reading, or a real motion
+FAR_OUTSIDE = 4.0  # minimum size of a jump, as a multiple of the usual difference
+AROUND_S = 0.03  # s; time on either side in which a delayed or filtered velocity catches up with a real motion
+KEPT = 0.6  # fraction of a jump that must remain after that time; otherwise, it is a bad reading or a real motion
 LONGEST_GAP = 5.0  # sample intervals
 FEWEST = 200  # samples
 

@@ -14,11 +14,11 @@ from hil.estimator import linalg
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import Recording
 
-SIDE = 5  # samples on either side of an interval
+SIDE = 5  # number of samples on either side of an interval
 ORDER = 3  # order of the polynomial that describes a smooth motion over these samples
-LEAST_NOISES = 20.0  # standard deviations of the noise, about six encoder steps if rounding is the noise
+LEAST_NOISES = 20.0  # standard deviations of the noise; about six encoder steps if the noise is due to rounding
 FEWEST = 200  # samples
-EVEN, MOST_UNEVEN = 1.01, 4.0  # longest interval around a jump over the usual one: limits for even, for usable
+EVEN, MOST_UNEVEN = 1.01, 4.0  # longest interval around a jump, relative to the usual one: if even, if usable
 AT_ONCE = 20_000  # number of uneven windows processed at once; each takes 1 kB
 BETTER = 0.25  # largest sum of squared residuals with a step, relative to that with a bad reading or a kink
 

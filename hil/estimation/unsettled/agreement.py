@@ -9,7 +9,7 @@ from hil.estimator.errors import EstimationError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
 from hil.estimator.models.terms import kind_of
 
-UNEXPLAINED = 1.5  # residual over noise above which the recordings are compared
+UNEXPLAINED = 1.5  # ratio of residual to noise above which the recordings are compared
 MUCH_BETTER = 0.5  # largest residual of separate fits, relative to that of the common one
 APART = 4.0  # standard deviations between the values of two recordings
 NAMED = 3  # number of parameters named in the message

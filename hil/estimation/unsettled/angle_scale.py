@@ -20,12 +20,12 @@ from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_sh
 
 SPRING = "cable_stiffness_1"
 CERTAIN = 4.0  # number of standard errors by which a spring must differ from 0 to be examined
-LEAST = 0.01  # deviation of a scale from 1
+LEAST = 0.01  # smallest deviation of a scale from 1 that is reported
 FARTHEST = 0.5, 2.0
 AS_WELL = 1.02  # largest ratio of the residuals at which the scale counts as explaining the motion equally well
-HANGS_AT = 0.3  # rad: the zero reveals the scale only if the joint hangs at least this far from the columns' origin
-CONSISTENT = 0.4  # largest difference between the scales from zero and from spring, relative to their deviation from 1
-RESTS = 0.2  # largest torque of the spring where the joint would hang, relative to its range in the motion
+HANGS_AT = 0.3  # rad; the zero reveals the scale only if the joint hangs at least this far from the columns' origin
+CONSISTENT = 0.4  # largest difference between scales inferred from zero and spring, relative to their deviation from 1
+RESTS = 0.2  # largest spring torque where the joint would hang, relative to the spring torque's range
 
 
 @dataclass(frozen=True)

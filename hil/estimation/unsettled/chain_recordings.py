@@ -33,7 +33,7 @@ from hil.results.result import ShootingResult
 
 FITTED_SHARE = 0.75  # fraction of each recording that is fitted; the rest serves as a check
 EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
-TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative error of the torque on the last part: trusted, rejected
+TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative torque error on the last part: limits for yes and no
 TORQUE_UNEXPLAINED = 0.1  # limit for rejecting a model that leaves part of the motion unexplained
 UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
 

@@ -10,7 +10,7 @@ from hil.estimator.fit.multiple_shooting import ShootingEstimate
 
 AS_WELL = 1.05  # largest mean square of the residual, relative to that of the chosen model
 WELL = 2.0  # mean square of the residual relative to the noise, up to which a defect is certain to be the cause
-MOSTLY = 0.8  # fraction of the residual that a defect must explain to be named at all
+MOSTLY = 0.8  # a defect is named only if it explains at least this fraction of the residual
 GAIN = 1.5  # mean square of the residual without the defect, relative to that with it, below which nothing is gained
 
 
@@ -94,7 +94,10 @@ def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> t
     percent = " and ".join(f"{100.0 * change:+.2g} %" for change in each)
     match hypothesis.course.kind:
         case "decay":
-            said = f"The friction of {whose} seems to start {percent} from its final value and to settle {when}"
+            said = (
+                f"The friction of {whose} seems to differ from its final value by {percent} at first, "
+                f"and to settle {when}"
+            )
             return said, "Let the arm move for a few minutes before you record, so that it is warm."
         case "linear":
             said = f"The friction of {whose} seems to change {when}, by {percent} of its initial value"

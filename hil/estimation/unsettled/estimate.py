@@ -39,7 +39,7 @@ from hil.runs.run_folder import RunFolder
 
 log = logging.getLogger(__name__)
 
-START_CUTOFFS = (8.0, 4.0, 2.0)  # Hz, for inverse dynamics, which gives the initial guess; the first usable one
+START_CUTOFFS = (8.0, 4.0, 2.0)  # Hz; the first usable one serves for inverse dynamics, which gives the initial guess
 START_WIDTH = 0.05  # rad/s
 JUMPED = (
     "A position jumped (see the warnings), so angles before and after the jump are inconsistent: use only the part "

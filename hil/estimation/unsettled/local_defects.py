@@ -15,14 +15,14 @@ FAR_ABOVE = 10.0  # residual of a window or stretch, relative to the usual resid
 ABOVE_NOISE = 5.0  # the same, relative to the noise
 MOST_WINDOWS = 0.3  # largest fraction of windows far above; with more, the defect is not local
 SHORTEST, FEWEST = 0.2, 10  # minimum duration [s] and number of samples of a constant value
-MOST_STRETCHES = 5  # largest number of constant stretches; more are normal for this joint or these commands
+MOST_STRETCHES = 5  # if there are more constant stretches, they are normal for this joint or these commands
 SPIKE_NOISES, SPIKE_USUAL, USUAL_QUANTILE = 20.0, 10.0, 0.95
-LONG = 1.5  # relative to the usual duration of five neighbouring samples; a longer one indicates a gap
-MOST_SPIKES = 0.05  # fraction of the samples
-IMPACT_TIME = 0.01  # s, time over which the velocities before and after an impact are measured
-IMPACT_USUAL, IMPACT_STEPS = 4.0, 20.0  # change of velocity relative to the usual one, and in encoder steps
+LONG = 1.5  # a duration of five neighbouring samples above this, relative to the usual one, indicates a gap
+MOST_SPIKES = 0.05  # if a larger fraction of the samples seems wrong, none of them is reported
+IMPACT_TIME = 0.01  # s; time over which the velocities before and after an impact are measured
+IMPACT_USUAL, IMPACT_STEPS = 4.0, 20.0  # minimum change of velocity: relative to the usual one, in encoder steps
 FEWEST_IMPACTS = 3
-SAME_PLACE = 0.02  # fraction of the range of motion
+SAME_PLACE = 0.02  # width of one place, as a fraction of the range of motion
 SHOWN = 3
 
 

@@ -13,9 +13,9 @@ from hil.estimator.simulation.back_emf import limited
 
 TORQUE = (2e-3, 60.0)  # N m: the largest torque of the smallest and of the largest servos (PH54: 45 N m continuous)
 PENDULUM = (0.01, 3.0)  # m: length of a pendulum with the joint's inertia and gravity
-LINK = (0.01, 2.0)  # m: length of link 1, which coupling and gravity_2 give
+LINK = (0.01, 2.0)  # m: length of link 1, which follows from coupling and gravity_2
 SURE = 4.0  # standard errors
-UNKNOWN = 0.5  # standard error over value
+UNKNOWN = 0.5  # ratio of standard error to value
 SHOWN = 1e-3  # fraction of a joint's largest torque, or a ratio, below which a value counts as zero
 
 

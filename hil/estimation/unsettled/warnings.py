@@ -13,13 +13,13 @@ from hil.estimator.models.terms import kind_of
 from hil.estimator.selection.verdict import MUCH_LEFT
 
 LEAST_SWING = 30.0  # encoder steps
-LOST = 0.01  # fraction of the samples
+LOST = 0.01  # fraction of missing samples above which a warning is given
 MANY_TURNS = 2.0
-FLAT = 0.05  # fraction of samples at the largest torque; a sine wave has fewer
-LEFT = 0.1  # RMS residual relative to the motion's RMS
-CERTAIN, LEAST_EARLY = 4.0, 0.1  # least negative delay that is reported, in standard errors and sampling intervals
-EQUAL, MOSTLY = 0.1, 0.9  # deviation of a step from a whole number of intervals; fraction of steps below it
-WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
+FLAT = 0.05  # fraction of samples at the largest torque that suggests clipping; for a sine wave, it is smaller
+LEFT = 0.1  # largest usable RMS residual, relative to the motion's RMS
+CERTAIN, LEAST_EARLY = 4.0, 0.1  # smallest negative delay that is reported: standard errors, intervals
+EQUAL, MOSTLY = 0.1, 0.9  # limit on a step's deviation from whole intervals; minimum fraction of steps within it
+WEAK, UNSEEN = 0.5, 10.0  # standard error, relative to the value, of a weak and of an undetermined parameter
 
 UNITS_ADVICE = "check the units, signs and zero of position and torque; then try shorter segments"
 

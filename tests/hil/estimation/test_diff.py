@@ -71,7 +71,7 @@ def test_joints_with_other_servos_may_be_another_arm() -> None:
 def test_arms_of_other_joint_count_are_refused(tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
     one = replace(MODEL, joints=(FACTS,))
     monkeypatch.setattr("hil.estimation.changes.diff.read_model", lambda path: one if "one" in str(path) else MODEL)
-    with pytest.raises(ResultError, match="one has 1 joints and two 2"):
+    with pytest.raises(ResultError, match="one has 1 joints and two has 2"):
         diff_runs("one", "two")  # type: ignore[arg-type]
 
 
