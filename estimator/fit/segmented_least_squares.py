@@ -234,7 +234,7 @@ def minimise_segmented(
         derivative: returns the residuals of a segment and their derivatives.
         shared: initial shared coordinates (shared,), of order 1.
         own: initial coordinates of each segment (segments, own), of order 1.
-        ftol: stop when the relative decrease in one step is below this.
+        ftol: stop when the relative decrease in one step is below this; after a failed step, in two steps.
         options: limits of the iteration.
         expected: prior on the shared coordinates.
         move: applies a step to the shared coordinates.
@@ -273,16 +273,20 @@ def minimise_segmented(
             is_curved = not is_first
             last, is_small = iteration == options.max_iterations, gained < ftol * cost
             if (is_small and (is_first or was_small)) or (last and gained < options.unfinished * cost):
-                equations = _equations(derivative, prior, shared, own, threads)
-                information, scores, _, _ = equations.eliminated(equations.residual, 0.0)
-                freedom = sum(map(np.count_nonzero, rows)) - shared.size - own.size  # zeros mark missing samples
-                variance = _cost(rows) / max(freedom, 1)
-                return Segmented(shared, own, cost, information, scores, iteration, variance, prior)
+                return _minimum(_equations(derivative, prior, shared, own, threads), shared, own, cost, iteration)
             was_small = is_small
     raise ConvergenceError(
         f"after {options.max_iterations} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} per "
         "iteration: try a simpler friction model or shorter segments"
     )
+
+
+def _minimum(equations: _Equations, shared: Array, own: Array, cost: float, iterations: int) -> Segmented:
+    information, scores, _, _ = equations.eliminated(equations.residual, 0.0)
+    rows = equations.residual
+    freedom = sum(map(np.count_nonzero, rows)) - shared.size - own.size  # zeros mark missing samples
+    variance = _cost(rows) / max(freedom, 1)
+    return Segmented(shared, own, cost, information, scores, iterations, variance, equations.prior)
 
 
 def _cost(rows: Sequence[Array]) -> float:
