@@ -63,6 +63,8 @@ class Nearest:
         return self.distance - self.needed
 
     def __str__(self) -> str:
+        if not np.isfinite(self.distance):
+            return "nothing in its way"
         return f"{self.pair[0]} and {self.pair[1]}: {1e3 * self.distance:.0f} mm"
 
 

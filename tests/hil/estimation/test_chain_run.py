@@ -1,6 +1,7 @@
 """A spatial arm from its TOML file to result, model and exports, on the fake bus."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from hil.chain_model import ChainArmModel
 from hil.cli.views.result_table import print_result
 from hil.config.schema import Config, load_config, parse_config
 from hil.description.urdf import read_urdf
-from hil.errors import ConfigError
+from hil.errors import ConfigError, ExportError
 from hil.estimation import chain_estimate
 from hil.estimation.calibrate import AddedMass, CalibrationFit, CalibrationResult, calibrate_runs, calibration_lines
 from hil.estimation.chain_estimate import _verdict, unmoved
@@ -33,7 +34,8 @@ from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.dynamics import inverse_dynamics
 from hil.estimator.chain.model.geometry import Chain, parameter_names
 from hil.experiment.run import run_experiment
-from hil.export.formats import export
+from hil.export.formats import Written, export
+from hil.export.mjcf import export_mjcf
 from hil.export.posterior import draw_arms
 from hil.export.source import Source
 from hil.plan.chain_model import KnownChain, known_chain
@@ -420,3 +422,65 @@ def test_a_value_less_certain_than_the_description_is_trusted_with_care(run: Run
     assert known.base.names[2] in verdict.sentences[-1]
     estimate.from_prior = (known.base.names[2],)  # named once is enough
     assert len(_verdict(config, estimate, known, np.full(4, 1e-3), []).sentences) == len(verdict.sentences)
+
+
+def torques_of(path: Path, q: NDArray[np.float64], a: NDArray[np.float64]) -> NDArray[np.float64]:
+    """MuJoCo's gravity and inertial torques (2, joints) [N m] of an exported arm at standstill."""
+    engine = mujoco.MjModel.from_xml_path(str(path))
+    engine.opt.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    data = mujoco.MjData(engine)
+    found = []
+    for acceleration in (np.zeros_like(a), a):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, 0.0, acceleration
+        mujoco.mj_inverse(engine, data)
+        found.append(data.qfrc_inverse.copy())
+    return np.stack((found[0], found[1] - found[0]))
+
+
+def test_the_torque_constant_scales_gravity_inertia_and_friction_of_drawn_arms_alike(
+    run: RunFolder, result: SettledResult, tmp_path: Path
+) -> None:
+    source = Source.open(run.path)
+    joints = tuple(replace(joint, torque_per_goal_std=0.1 * joint.torque_per_goal) for joint in source.model.joints)
+    source = replace(source, model=replace(source.model, joints=joints))
+    given, varied = (draw_arms(source, 4, torque_constants=each) for each in (False, True))
+    q, a = np.random.default_rng(3).standard_normal((2, 4))
+    assert np.ptp(varied.torque_factor) > 0.05
+    for number, factor in enumerate(varied.torque_factor.tolist()):
+        paths = [tmp_path / f"{name}_{number}.xml" for name in ("given", "varied")]
+        for path, drawn in zip(paths, (given, varied), strict=True):
+            export_mjcf(replace(source, model=drawn.models[number]), path)
+        before, after = (torques_of(path, q, a) for path in paths)
+        np.testing.assert_allclose(after, factor * before, rtol=2e-3, atol=2e-5)
+        frictions = [ET.parse(path).find(".//joint[@name='joint2']") for path in paths]
+        loss = [0.0 if each is None else float(each.get("frictionloss", 0)) for each in frictions]
+        assert loss[1] == pytest.approx(factor * loss[0])
+
+
+def test_an_arm_without_physically_consistent_links_is_not_exported_silently(
+    run: RunFolder, result: SettledResult, tmp_path: Path
+) -> None:
+    """The names and the size of the difference are in the file and on the terminal; a large one is refused."""
+    source = Source.open(run.path)
+    model = source.model
+    assert isinstance(model, ChainArmModel)
+    stated, wider = (
+        dict(model.values),
+        {name: max(std, 0.5 * abs(model.values[name])) for name, std in model.stds.items()},
+    )
+    least = min((name for name in model.groups if name.startswith("armature")), key=lambda name: stated[name])
+    slightly = replace(source, model=replace(model, values=stated | {least: -0.1 * stated[least]}, stds=wider))
+    left = export_mjcf(slightly, tmp_path / "slightly.xml")
+    found = Written("mjcf", tmp_path / "slightly.xml", left)
+    assert re.search(r"no physically consistent links have the identified values.* differ by .* % \(joint", left[0])
+    assert (
+        "is not equivalent to the identified one" in found.warning
+        and left[0] in (tmp_path / "slightly.xml").read_text()
+    )
+    assert "NOT dynamically equivalent" in (tmp_path / "slightly.xml").read_text()
+    assert Written("mjcf", run.path, export_mjcf(source, tmp_path / "arm.xml")).warning == ""
+    assert "NOT dynamically equivalent" not in (tmp_path / "arm.xml").read_text()
+    inertias = {name: -value for name, value in stated.items() if name.startswith(("inertia", "armature"))}
+    with pytest.raises(ExportError, match="at most 20 % is exported"):
+        export_mjcf(replace(source, model=replace(model, values=stated | inertias, stds=wider)), tmp_path / "no.xml")
+    assert not (tmp_path / "no.xml").exists()
