@@ -69,8 +69,8 @@ def export(
         print(f"{len(drawn.models)} arms in {folder}")
         if drawn.inexact:
             print(
-                f"Warning: {drawn.inexact} of these arms are not the drawn ones, because no physically consistent links "
-                "have their values; their files say how far the torques differ.",
+                f"Warning: {drawn.inexact} of these arms are not equivalent to the drawn ones, because no physically "
+                "consistent links have their values; their files say how far the torques differ.",
                 file=sys.stderr,
             )
         return

@@ -28,8 +28,8 @@ HALVINGS = 12
 LEAST_LEFT = 0.1  # of a link's mass, after separating what held joints move
 FAR = 3.0  # standard errors between physical links and identified parameters above which a note is added
 DIFFERENT, USELESS = 0.01, 0.2
-"""Relative RMS difference between a joint's torques in the file and those identified, above which a warning is given, or
-the export is refused.
+"""Relative RMS differences between a joint's torques in the file and those identified, above which a warning is given
+or the export is refused.
 """
 LITTLE_PULL = 1e-3
 """Weight of the description if the usual one draws the torques away from uncertain identified values."""
@@ -86,8 +86,8 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
     said = []
     if found.misfit > FAR or different.max() > DIFFERENT:
         said.append(
-            f"{NOT_EXACT}no physically consistent links have the identified values. Those in the file are up to {found.misfit:.1f} "
-            f"standard errors away, and the joints' torques differ by {_by_joint(model, different)}"
+            f"{NOT_EXACT}no physically consistent links have the identified values. Those in the file are up to "
+            f"{found.misfit:.1f} standard errors away, and the joints' torques differ by {_by_joint(model, different)}"
         )
     bodies = tuple(_body(row) for row in found.links)
     return ChainLinks(path, arm, bodies, tuple(found.armature.tolist()), tuple(said))
