@@ -43,14 +43,15 @@ def mounted_otherwise(
         explained: whether the model explains the motion.
     """
     base, before = mount_angles(gravity), mount_angles(assumed)
-    contradiction = _on_the_other_side(arm, opposed) if opposed else "The recording contradicts the description."
+    contradiction = _on_the_other_side(arm, opposed) if opposed else f"The recording contradicts {arm.path.name}."
     return MountDoubt(
         "with care" if explained else "no",
         (
             contradiction,
-            f"They agree if the base is mounted differently: {_mount_said(gravity)}, base = {base} under [arm]. The "
+            f"The two agree if the base is mounted differently: {_mount_said(gravity)}, base = {base} under [arm]; the "
             f"configuration implies {before}, apart from a rotation about the vertical. Check how the arm is mounted, "
-            f"and correct base.{_same_as(arm, assumed, gravity)}",
+            f"and correct base.{_same_as(arm, assumed, gravity)} The recording remains usable: after base has been "
+            "corrected in the run's config.toml, `hil estimate` suffices.",
             _still_right(explained),
         ),
         f"set base = {base} under [arm], or correct what else is wrong (see the verdict)",
@@ -93,7 +94,7 @@ def _on_the_other_side(arm: ArmDescription, opposed: Sequence[Opposed]) -> str:
         for each in opposed
     ]
     return (
-        f"Gravity acts on the arm as if centres of mass were on the opposite side of where {arm.path.name} has them: "
+        f"The recording contradicts {arm.path.name}: gravity acts as if centres of mass were on the opposite side, "
         f"{'; '.join(parts)}."
     )
 
@@ -126,7 +127,7 @@ def _same_as(arm: ArmDescription, assumed: Array, gravity: Array) -> str:
 def _still_right(explained: bool) -> str:
     if explained:
         return (
-            "Friction and the torques at the measured angles are right for the arm as it is mounted now; centres of "
-            "mass, inertias and exported links are not those of the described arm."
+            "Friction and the torques at the measured angles are right for the arm as it is mounted now; the centres "
+            "of mass and the exported links are not those of the described arm."
         )
     return "The other values are distorted as well, since the model does not explain the motion."
