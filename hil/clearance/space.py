@@ -62,7 +62,14 @@ class Nearest:
         """Distance minus required distance [m]; negative if too close."""
         return self.distance - self.needed
 
+    @property
+    def is_limited(self) -> bool:
+        """Whether there is any pair to be checked."""
+        return bool(np.isfinite(self.distance))
+
     def __str__(self) -> str:
+        if not self.is_limited:
+            return "no parts that could collide"
         return f"{self.pair[0]} and {self.pair[1]}: {1e3 * self.distance:.0f} mm"
 
 

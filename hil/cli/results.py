@@ -67,6 +67,12 @@ def export(
         folder = out or run / "arms"
         drawn = export_samples(run, formats, folder, samples, seed, link_length)
         print(f"{len(drawn.models)} arms in {folder}")
+        if drawn.inexact:
+            print(
+                f"Warning: {drawn.inexact} of these arms are not equivalent to the drawn ones, because no physically "
+                "consistent links have their values; their files say how far the torques differ.",
+                file=sys.stderr,
+            )
         return
     from hil.export.formats import export
     from hil.export.source import MissingPackages
@@ -81,8 +87,10 @@ def export(
             needs += error.needs
             continue
         print(f"{written.path}")
-        for missing in written.left_out:
+        for missing in written.left_out[1 if written.warning else 0 :]:
             print(f"  {name.upper()} cannot represent {missing}")
+        if written.warning:
+            print(f"Warning: {written.warning}", file=sys.stderr)
     if needs:
         raise MissingPackages(*needs)
 

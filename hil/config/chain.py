@@ -97,9 +97,14 @@ def _mounted(gravity: Array) -> str:
     strength = float(np.linalg.norm(gravity))
     if strength <= _SAME_GRAVITY:
         return "The file sets gravity to zero: correct it."
-    x, y, z = (-gravity / strength + 0.0).tolist()
-    base = [round(angle, 4) for angle in (math.atan2(y, z), -math.asin(max(-1.0, min(1.0, x))), 0.0)]
+    base = mount_angles(gravity)
     return f"If the arm is mounted as the file says, set base = {base} and gravity = {strength:.4g} under [arm]."
+
+
+def mount_angles(gravity: Array) -> list[float]:
+    """Roll, pitch and yaw for `base` [rad] that produce this direction of gravity in the frame of the base (3,)."""
+    x, y, z = (-gravity / float(np.linalg.norm(gravity)) + 0.0).tolist()
+    return [round(angle, 4) + 0.0 for angle in (math.atan2(y, z), -math.asin(max(-1.0, min(1.0, x))), 0.0)]
 
 
 def base_gravity(config: "Config") -> Array:

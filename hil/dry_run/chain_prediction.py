@@ -51,6 +51,8 @@ class ChainPrediction:
         return bool((self.rooms >= 0.0).all())
 
     def __str__(self) -> str:
+        if not self.nearest.is_limited:
+            return str(self.nearest)
         where = f"{self.moment:.1f} s into {self.role!r}"
         return f"{self.nearest}, at least {1e3 * self.nearest.needed:.0f} mm required, {where}"
 

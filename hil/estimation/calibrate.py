@@ -187,9 +187,8 @@ def calibration_lines(result: CalibrationResult) -> list[str]:
     lines.append(f"Largest residual in either run: {worst:.3f} encoder steps RMS; rounding alone gives 0.289.")
     if not result.fit.reached:
         lines.append(
-            "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
-            "the remaining distance to the minimum. Record both runs again with faster motion before relying on these "
-            "values."
+            "The fit stopped short of its minimum; the standard errors include the remaining distance to the minimum. "
+            "Record both runs again before relying on these values, with faster motion if a joint sticks."
         )
     lines.append("The standard errors cover noise only: add the relative errors of the mass and of its distance.")
     lines.append("Set torque_constant (torque_per_volt in pwm mode) of each joint to these values and estimate again.")

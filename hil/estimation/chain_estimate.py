@@ -1,6 +1,7 @@
 """Estimate a spatial arm's parameters from its run folder in two stages, and validate them on a held-out path."""
 
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -10,6 +11,7 @@ from hil.config.schema import Config
 from hil.config.varying_delay import varying_delay
 from hil.description.arm import ArmDescription
 from hil.errors import RecordingCutShort
+from hil.estimation.chain_mount import MountDoubt, mass_on_the_other_side, mounted_otherwise
 from hil.estimation.drive.currents import settled_current_findings
 from hil.estimation.model_from_config import voltage_driven
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts, quantities
@@ -17,6 +19,7 @@ from hil.estimation.result_checks import describe_chain_choice
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.slips.position_jumps import jump_disturbances
+from hil.estimation.slips.sticking import sticking_joints
 from hil.estimation.torque_constants import RATIO, contradictions, ratios_of
 from hil.estimation.truth import back_emf, scaled
 from hil.estimator.arrays import Array
@@ -26,6 +29,7 @@ from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.model.tilt import TILT, tilt_between
+from hil.estimator.chain.mount import SURE, better_gravity, opposed_moments
 from hil.estimator.chain.simulation.prediction import predict
 from hil.estimator.models.bounds import bound_sentence
 from hil.estimator.models.conflicts import Trust, conflict_sentences, contradicted, lowered
@@ -100,6 +104,8 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
             beyond,
             unmoved(config, period.position),
             (*jump_disturbances(config, facts, samples), *currents.disturbances),
+            better_gravity(period, model, described_arm(config).parameters),
+            sticking_joints(period.position, period.rate, period.position_step),
         ),
         model_choice=None if choice is None else describe_chain_choice(choice),
         warnings=(
@@ -186,19 +192,30 @@ def _verdict(
     held_out: Array | None,
     still: list[str],
     disturbances: tuple[str, ...] = (),
+    gravity: Array | None = None,
+    sticking: tuple[int, ...] = (),
 ) -> Verdict:
-    count = known.base.count
-    certain = estimate.std[:count] / known.prior.std
+    """The verdict, with reasons.
+
+    held_out: relative prediction error on the held-out path (joints,); None without one. still: names of joints that
+    hardly moved. gravity: the direction with which the recording agrees with the description; see `better_gravity`.
+    sticking: joints that stick, from 0.
+    """
+    joints = [joint.name for joint in config.joints]
+    certain = estimate.std[: known.base.count] / known.prior.std
     weakest = known.base.names[int(np.argmax(certain))]
     explained = is_explained(estimate)
-    sentences = [_unexplained(config, estimate)]
+    sentences = [_unexplained(config, estimate, gravity)]
     trust: Trust = "yes" if explained else "with care"
+    mount = doubted_mount(config, estimate, known, gravity)
+    if mount is not None:
+        sentences += mount.said
     if held_out is None:
         sentences.append("No second path was recorded, so the prediction could not be validated.")
         trust = "with care"
     else:
         error = float(np.max(held_out))
-        joint = config.joints[int(np.argmax(held_out))].name
+        joint = joints[int(np.argmax(held_out))]
         sentences.append(
             f"A held-out path is predicted to within {100 * error:.2f} % of its motion's RMS (worst joint: {joint}), "
             "excluding encoder noise."
@@ -208,37 +225,25 @@ def _verdict(
         trust = lowered(trust, "with care")
     if said := about_zeros(config, estimate):
         sentences.append(said)
-    if disturbances:
-        trust = lowered(trust, "with care")
-        sentences += disturbances
     if still:
         trust = "no"
         sentences.append(
             f"{', '.join(still)} hardly moved, so the recording reveals little about their inertia and friction: "
             "increase joint_path.swing and speed, and check that nothing blocks the motion."
         )
-    if estimate.from_prior:
+    cautions = [
+        *disturbances,
+        _from_prior(estimate),
+        vague(known.prior, known.base.names, estimate.std, estimate.from_prior),
+        ""
+        if estimate.reached
+        else stopped_short([joints[each] for each in sticking], "Use faster motion ([joint_path])"),
+        bound_sentence(estimate.at_bound) if estimate.at_bound else "",
+        *contradicting_torques(config, estimate),
+    ]
+    if any(cautions):
         trust = lowered(trust, "with care")
-        sentences.append(
-            f"The recording reveals little about {', '.join(estimate.from_prior)}: these values come from the URDF. "
-            "Use wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the "
-            "motion."
-        )
-    if said := vague(known.prior, known.base.names, estimate.std, estimate.from_prior):
-        trust = lowered(trust, "with care")
-        sentences.append(said)
-    if not estimate.reached:
-        trust = lowered(trust, "with care")
-        sentences.append(
-            "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
-            "the remaining distance to the minimum. Use faster motion ([joint_path]), so that fewer joints stick."
-        )
-    if estimate.at_bound:
-        trust = lowered(trust, "with care")
-        sentences.append(bound_sentence(estimate.at_bound))
-    if said_of_torques := contradicting_torques(config, estimate):
-        trust = lowered(trust, "with care")
-        sentences += said_of_torques
+        sentences += filter(None, cautions)
     trust = lowered(trust, contradicted(estimate.conflicts, explained))
     sentences += conflict_sentences(estimate.conflicts, explained)
     if estimate.unseen:
@@ -246,7 +251,44 @@ def _verdict(
             f"Not identifiable from gravity in this motion: {', '.join(estimate.unseen)} (assumed to be zero, with "
             "the standard errors given)."
         )
-    return Verdict(trust, weakest, tuple(sentences))
+    if mount is None:
+        return Verdict(trust, weakest, tuple(sentences))
+    return Verdict(lowered(trust, mount.at_most), weakest, tuple(sentences), mount.first)
+
+
+def _from_prior(estimate: ChainEstimate) -> str:
+    """Name the parameters that come from the description; "" if there are none."""
+    if not estimate.from_prior:
+        return ""
+    return (
+        f"The recording reveals little about {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
+        "wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
+    )
+
+
+def doubted_mount(
+    config: Config, estimate: ChainEstimate, known: KnownChain, gravity: Array | None
+) -> MountDoubt | None:
+    """Return the contradiction between the centres of mass and the description, if there is one."""
+    arm, explained = described_arm(config), is_explained(estimate)
+    sure = SURE if gravity is None else 0.0
+    opposed = opposed_moments(estimate.names, estimate.value, estimate.std, known.prior, sure)
+    if gravity is None:
+        return mass_on_the_other_side(arm, opposed, explained, mounts_tried=True)
+    return mounted_otherwise(arm, opposed, known.base.chain.gravity, gravity, explained)
+
+
+def stopped_short(sticking: Sequence[str], remedy: str) -> str:
+    """State that the fit stopped short of its minimum, and name the joints that stick.
+
+    remedy: what to do about joints that stick.
+    """
+    said = "The fit stopped short of its minimum; the standard errors include the remaining distance to the minimum."
+    if not sticking:
+        return said
+    return (
+        f"{said} {', '.join(sticking)} sticks at times, which can be the cause. {remedy}, so that fewer joints stick."
+    )
 
 
 def contradicting_torques(config: Config, estimate: ChainEstimate) -> tuple[str, ...]:
@@ -259,13 +301,14 @@ def contradicting_torques(config: Config, estimate: ChainEstimate) -> tuple[str,
 
 def about_zeros(config: Config, estimate: ChainEstimate) -> str:
     """State that encoder zeros were not fitted, and which ones the recording contradicts; "" if they were fitted."""
-    if estimate.model.zeros or estimate.model.joints == 1:
+    if estimate.model.zeros:
         return ""
     held = "The encoder zeros were taken from the configuration and not identified"
     if not estimate.doubtful_zeros:
         return (
-            f"{held}: if they contain an error that this motion does not reveal, the link parameters are wrong even "
-            "though the torques are correct. Use `hil pose` to check the angles by hand."
+            f"{held}: if they contain an error that this motion does not reveal, or if `direction` or `base` is wrong, "
+            "the link parameters are wrong even though the torques are correct. Use `hil pose` to check the angles by "
+            "hand."
         )
     off = ", ".join(
         f"{config.joints[joint - 1].name} is off by about {by:.2g} rad" for joint, by in estimate.doubtful_zeros
@@ -292,7 +335,7 @@ def is_explained(estimate: ChainEstimate) -> bool:
     return float(estimate.over_noise.max()) <= EXPLAINED and estimate.systematic <= SYSTEMATIC
 
 
-def _unexplained(config: Config, estimate: ChainEstimate) -> str:
+def _unexplained(config: Config, estimate: ChainEstimate, gravity: Array | None) -> str:
     over, joint = float(estimate.over_noise.max()), int(np.argmax(estimate.over_noise))
     noise = float(estimate.noise_steps[joint])
     measured = (
@@ -303,6 +346,8 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     said = f"The largest residual ({config.joints[joint].name}) is {over:.2f} times {measured};"
     if is_explained(estimate):
         return f"{said} nothing remains unexplained."
+    if gravity is not None:
+        return f"{said} the model is incomplete, probably because the arm is not mounted as configured."
     causes = (
         "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time, joints "
         "whose position or axis differs from the description, or whose key `direction` is wrong"

@@ -60,7 +60,7 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
         dynamics.set("damping", numbers(model.values[f"viscous_{index + 1}"]))
         dynamics.set("friction", numbers(model.values[f"coulomb_{index + 1}"]))
     rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
-    left = [*rotors, *reduced, *found.left_out, *chain_left_out(model), *torque_constants(model)]
+    left = [*found.left_out, *rotors, *reduced, *chain_left_out(model), *torque_constants(model)]
     _describe(root, model, found, left)
     write_text(path, to_text(root))
     return left
@@ -70,7 +70,7 @@ def _export_own_urdf(found: ChainLinks, model: ChainArmModel, path: Path) -> lis
     """Write the URDF of an arm described in MJCF, with its joints, frames and body names."""
     root = ET.Element("robot", name=found.path.stem)
     rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
-    left = ["the MJCF's shapes", *_held(found), *rotors, *found.left_out]
+    left = [*found.left_out, "the MJCF's shapes", *_held(found), *rotors]
     left += [*chain_left_out(model), *torque_constants(model)]
     _describe(root, model, found, left)
     ET.SubElement(root, "link", name=found.arm.base)
@@ -101,9 +101,9 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
     root = ET.Element("mujoco", model=found.path.stem)
     solids = solids_of(found.arm)
     left = [
+        *found.left_out,
         *_not_in_mjcf(found, solids),
         *_held(found),
-        *found.left_out,
         *chain_left_out(model, _IN_MJCF),
     ]
     _describe(root, model, found, left)
@@ -163,10 +163,11 @@ def _add_geoms(body: ET.Element, solids: Sequence[Solid]) -> None:
 
 
 def _describe(root: ET.Element, model: ChainArmModel, found: ChainLinks, left: list[str]) -> None:
+    which = "dynamically equivalent" if found.is_exact else "physically consistent, but NOT dynamically equivalent"
     words = [
         f"Inertias, damping and friction identified by hil {__version__}; everything else is from {found.path.name}.",
-        "The link inertias are the dynamically equivalent ones closest to that file's. Only the following "
-        "combinations were identified:",
+        f"The link inertias are the {which} ones closest to that file's. Only the following combinations were "
+        "identified:",
         *(f"{model.groups[name]} = {model.values[name]!r} +- {model.stds[name]:.1e}" for name in model.groups),
         *(f"Not representable in this format: {sentence}" for sentence in left),
     ]

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Generic, TypeVar
 
 from hil.errors import ExportError
+from hil.export.chain_links import NOT_EXACT
 from hil.export.mcap import export_mcap
 from hil.export.mjcf import export_mjcf
 from hil.export.parameters import export_json, export_toml
@@ -58,6 +59,14 @@ class Written:
     format: str
     path: Path
     left_out: list[str]
+
+    @property
+    def warning(self) -> str:
+        """How far the arm in the file is from the identified one; "" if they are dynamically equivalent."""
+        why = next(iter(self.left_out), "")
+        if not why.startswith(NOT_EXACT):
+            return ""
+        return f"the arm in {self.path} is not equivalent to the identified one: {why.removeprefix(NOT_EXACT)}."
 
 
 def export(run: Path, name: str, out: Path | None = None, link_length: float | None = None) -> Written:

@@ -18,6 +18,7 @@ from hil.chain_model import ChainArmModel
 from hil.errors import ExportError, RunFolderError
 from hil.estimator.arrays import Array
 from hil.estimator.models.terms import kind_of
+from hil.export.chain_links import NOT_EXACT
 from hil.export.mjcf import export_mjcf
 from hil.export.source import MissingPackages, Source
 from hil.export.urdf import export_urdf
@@ -34,8 +35,8 @@ _LEAST_WIDTH = 1e-4
 _POSES = 20
 """Number of poses in which the mass matrix of a drawn spatial arm must be positive definite."""
 
-_IN_TORQUE = ("N m", "kg m^2")
-"""Prefixes of the units of parameters that scale with the torque constant."""
+_WITH_TORQUE = ("N", "kg")
+"""Beginnings of the units of parameters that scale with the torque constant: torques, masses and their moments."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ class Drawn:
     """Arms drawn from one result.
 
     values: parameters (samples, names) [SI]. torque_factor: common torque factor (samples,), with a mean of 1. redrawn:
-    number of draws without physically possible masses, which were replaced.
+    number of draws without physically possible masses, which were replaced. inexact: number of arms whose files are not
+    dynamically equivalent to what was drawn.
     """
 
     models: tuple[ArmModel, ...]
@@ -51,6 +53,7 @@ class Drawn:
     values: Array
     torque_factor: Array
     redrawn: int
+    inexact: int = 0
 
 
 def draw_arms(source: Source, samples: int, seed: int = 1, *, torque_constants: bool = True) -> Drawn:
@@ -69,7 +72,7 @@ def draw_arms(source: Source, samples: int, seed: int = 1, *, torque_constants: 
     spread = _torque_spread(source.model) if torque_constants else 0.0
     factor = np.exp(spread * _matched(rng, samples, 1)[:, 0])
     factor /= factor.mean()
-    scaled = np.array([source.result.quantities[name].unit.startswith(_IN_TORQUE) for name in names])
+    scaled = np.array([source.result.quantities[name].unit.startswith(_WITH_TORQUE) for name in names])
     values = np.where(scaled, values * factor[:, None], values)
     models = tuple(_model(source.model, names, row, each) for row, each in zip(values, factor, strict=True))
     return Drawn(models, names, values, factor, redrawn)
@@ -93,14 +96,17 @@ def export_samples(
     except OSError as error:
         raise RunFolderError(f"{out} cannot be created: {error.strerror}.") from error
     _nothing_older(formats, out, samples)
+    inexact = set()
     for name in sorted(formats, key=lambda name: name == "parquet"):  # last, as its package may be missing
         if name == "parquet":
             _write_table(source, drawn, out / TABLE)
             continue
         write, ending = FORMATS[name]
         for number, model in enumerate(drawn.models):
-            write(replace(source, model=model), out / f"arm_{number:04d}.{ending}")
-    return drawn
+            left = write(replace(source, model=model), out / f"arm_{number:04d}.{ending}")
+            if any(each.startswith(NOT_EXACT) for each in left):
+                inexact.add(number)
+    return replace(drawn, inexact=len(inexact))
 
 
 def _nothing_older(formats: Sequence[str], out: Path, samples: int) -> None:

@@ -174,12 +174,14 @@ class Validation:
 class Verdict:
     """The verdict on a result.
 
-    trust: "yes", "with care" or "no". weakest: the least certain parameter. sentences: the reasons.
+    trust: "yes", "with care" or "no". weakest: the least certain parameter. sentences: the reasons. first: what to
+    correct or check before using the result; None if nothing.
     """
 
     trust: str
     weakest: str
     sentences: tuple[str, ...]
+    first: str | None = None
 
 
 @dataclass(frozen=True)

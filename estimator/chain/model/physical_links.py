@@ -16,7 +16,7 @@ from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS
 
-PULL = 0.03  # weight of a unit change in a coordinate, relative to one standard error of a base parameter
+PULL = 0.03  # default weight of a unit change in a coordinate, relative to one standard error of a base parameter
 LEAST_MASS = 1e-4  # kg
 LEAST_SPREAD = 1e-3  # m: minimum radius of gyration, for links described as point masses
 STEP = 1e-4  # step of the central differences, relative to a coordinate's typical step
@@ -37,7 +37,9 @@ class PhysicalLinks:
 
 
 @one_blas_thread
-def nearest_links(base: BaseParameters, value: Array, std: Array, described: Array, armature: Array) -> PhysicalLinks:
+def nearest_links(
+    base: BaseParameters, value: Array, std: Array, described: Array, armature: Array, pull: float = PULL
+) -> PhysicalLinks:
     """Return the links and rotors that agree with the identified base parameters and are nearest to the described ones.
 
     Args:
@@ -46,6 +48,7 @@ def nearest_links(base: BaseParameters, value: Array, std: Array, described: Arr
         std: their standard errors (base parameters,) [SI].
         described: link parameters of the description (joints, 10) [SI].
         armature: described reflected rotor inertias (joints,) [kg m^2].
+        pull: weight of the description.
     """
     joints = base.chain.joints
     floor = np.maximum(std, 1e-6 * np.abs(value).max())
@@ -60,7 +63,7 @@ def nearest_links(base: BaseParameters, value: Array, std: Array, described: Arr
         return away
 
     def residual(x: Array) -> Array:
-        return np.concatenate((misfit(x), PULL * (x - start) / scale))
+        return np.concatenate((misfit(x), pull * (x - start) / scale))
 
     def slopes(x: Array) -> Array:
         # A coordinate changes one link's parameters only, so the blocks are differentiated one by one.
@@ -69,7 +72,7 @@ def nearest_links(base: BaseParameters, value: Array, std: Array, described: Arr
             own = slice(10 * link, 10 * link + 10)
             by_x[TERMS * link : TERMS * link + 10, own] = own_slopes[link]
             by_x[TERMS * link + 10, 10 * joints + link] = np.exp(x[10 * joints + link])
-        return np.concatenate((base.grouping @ by_x / floor[:, None], np.diag(PULL / scale)))
+        return np.concatenate((base.grouping @ by_x / floor[:, None], np.diag(pull / scale)))
 
     scale = np.concatenate((np.tile(_scales(), joints), np.ones(joints)))
     found = linalg.least_squares(residual, start, slopes, x_scale=scale, max_nfev=200)

@@ -184,15 +184,24 @@ def _next(result: SettledResult, run: Path) -> list[str]:
     return [
         f"Run folder: {run}, report: {run / 'report.html'}",
         *([] if _is_useless(result) else [f"To estimate again from the recording: {command('estimate', run)}"]),
-        what_next(result, run),
+        *what_next(result, run).splitlines(),
     ]
 
 
 def what_next(result: Result, run: Path) -> str:
     """Return the line that names the next command: `hil export`; if the verdict is "no", `hil check` or, for recordings
-    made with other tools, `hil estimate`.
+    made with other tools, `hil estimate`. If the verdict asks for something to be corrected first, a line before
+    says so, and the command is not `hil export`.
     """
-    if not _is_useless(result):
+    first = None if result.verdict is None else result.verdict.first
+    if first is not None:
+        return f"First {first}.\n{_next_command(result, run)}"
+    return _next_command(result, run)
+
+
+def _next_command(result: Result, run: Path) -> str:
+    has_doubts = result.verdict is not None and result.verdict.first is not None
+    if not _is_useless(result) and not has_doubts:
         return next_step("export", run, "--format", _usual_format(result))
     return next_step("estimate", run) if _is_of_recordings(result) else next_step("check", result.config)
 

@@ -13,7 +13,9 @@ from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
-from hil.estimation.chain_estimate import chain_facts, vague
+from hil.estimation.chain_estimate import chain_facts, stopped_short, vague
+from hil.estimation.chain_mount import mass_on_the_other_side
+from hil.estimation.slips.sticking import sticking_joints
 from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
 from hil.estimation.unsettled.chain_slips import late_torque, refuse_chain_slips, torques_apart
 from hil.estimator.arrays import Array
@@ -23,6 +25,7 @@ from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel, Drive
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.prior import Prior
+from hil.estimator.chain.mount import opposed_moments
 from hil.estimator.chain.recordings import MotionPiece, RecordedChain, identify_recordings, torque_error
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
@@ -105,7 +108,7 @@ def estimate_chain_recordings(
         validation=Validation(
             residual_over_floor=tuple(found.residual_over_noise.tolist()) if found.simulated else None
         ),
-        verdict=_verdict(found, arm, foretold, prior, contradictory, late),
+        verdict=_verdict(found, arm, foretold, prior, contradictory, late, _sticking(recordings)),
         warnings=doubted_inertias(arm),
         timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),
         chain=chain_facts(arm, base, found.from_prior),
@@ -153,6 +156,15 @@ def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior
     return identify_recordings(recordings, model, prior)
 
 
+def _sticking(recordings: Sequence[Recording]) -> tuple[int, ...]:
+    """Return the joints, from 0, that stick in any of the recordings."""
+    found = set()
+    for each in recordings:
+        rate = (each.time.size - 1) / (each.time[-1] - each.time[0])
+        found |= set(sticking_joints(each.position, float(rate), each.position_step))
+    return tuple(sorted(found))
+
+
 def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> Array | None:
     """Return the relative torque error on the last part of each recording, with parameters fitted to the rest.
 
@@ -198,10 +210,12 @@ def _verdict(
     prior: Prior,
     contradictory: Sequence[str] = (),
     late: Sequence[str] = (),
+    sticking: Sequence[int] = (),
 ) -> Verdict:
     """The verdict, with reasons.
 
     contradictory, late: sentences about torques that contradict each other in the regression, or are logged late.
+    sticking: joints that stick, from 0.
     """
     names = found.model.base.names
     weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
@@ -259,11 +273,13 @@ def _verdict(
         sentences += contradictory
     if not found.reached:
         trust = lowered(trust, "with care")
-        sentences.append(
-            "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
-            "the remaining distance to the minimum. Record faster motion, so that fewer joints stick."
-        )
-    return Verdict(trust, weakest, tuple(sentences))
+        names_stuck = [arm.joints[joint].name for joint in sticking]
+        sentences.append(stopped_short(names_stuck, "Record faster motion"))
+    opposed = opposed_moments(found.names, found.value, found.std, prior)
+    mount = mass_on_the_other_side(arm, opposed, explained, mounts_tried=False)
+    if mount is None:
+        return Verdict(trust, weakest, tuple(sentences))
+    return Verdict(lowered(trust, mount.at_most), weakest, (*sentences, *mount.said), mount.first)
 
 
 def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: bool) -> tuple[str, tuple[str, ...]]:

@@ -49,3 +49,8 @@ def test_what_helps_depends_on_what_keeps_a_joint_from_the_rest_pose() -> None:
     assert "Raise its current_limit, lower safety.lower_speed, " in _helps(leg, 1, 0.9 * most, 1.0, 0.5 * limit)
     assert "Raise its current_limit, raise safety.lower_time, " in _helps(leg, 1, 1.1 * most, 1.0, 0.5 * limit)
     assert f"Raise experiment.rate above {leg.experiment.rate:g}" in _helps(leg, 1, 0.9 * most, 0.4, 0.5 * limit)
+
+
+def test_an_arm_without_parts_that_could_collide_has_no_clearance_to_state() -> None:
+    assert str(Nearest(np.inf, 0.0, ("nothing", "nothing"), 0)) == "no parts that could collide"
+    assert str(FREE) == "hand and floor: 50 mm"

@@ -1,6 +1,7 @@
 """A spatial arm from its TOML file to result, model and exports, on the fake bus."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,30 +17,37 @@ from rich.console import Console
 
 import hil
 from hil.chain_model import ChainArmModel
-from hil.cli.views.result_table import print_result
+from hil.cli.views.result_table import print_result, what_next
+from hil.config.chain import described_arm
 from hil.config.schema import Config, load_config, parse_config
 from hil.description.urdf import read_urdf
-from hil.errors import ConfigError
+from hil.errors import ConfigError, ExportError
 from hil.estimation import chain_estimate
 from hil.estimation.calibrate import AddedMass, CalibrationFit, CalibrationResult, calibrate_runs, calibration_lines
-from hil.estimation.chain_estimate import _verdict, unmoved
+from hil.estimation.chain_estimate import _verdict, stopped_short, unmoved
 from hil.estimation.changes.diff import diff_runs
 from hil.estimation.comparison import chain_compare
 from hil.estimation.comparison.compare import compare_run
 from hil.estimation.settled_estimate import estimate_run
+from hil.estimation.settled_period import settled_period
+from hil.estimation.slips.sticking import sticking_joints
 from hil.estimation.unsettled.estimate import estimate_unsettled
 from hil.estimator.chain.conflicts import chain_conflicts
+from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.dynamics import inverse_dynamics
 from hil.estimator.chain.model.geometry import Chain, parameter_names
+from hil.estimator.chain.mount import better_gravity
 from hil.experiment.run import run_experiment
-from hil.export.formats import export
+from hil.export.formats import Written, export
+from hil.export.mjcf import export_mjcf
 from hil.export.posterior import draw_arms
 from hil.export.source import Source
 from hil.plan.chain_model import KnownChain, known_chain
 from hil.plan.chain_plan import make_chain_plan
+from hil.plan.plan import IDENTIFY
 from hil.results.parts import Quantity
-from hil.results.result import SettledResult
+from hil.results.result import SettledResult, result_from_json
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 from tests.support.edits import replaced
@@ -420,3 +428,124 @@ def test_a_value_less_certain_than_the_description_is_trusted_with_care(run: Run
     assert known.base.names[2] in verdict.sentences[-1]
     estimate.from_prior = (known.base.names[2],)  # named once is enough
     assert len(_verdict(config, estimate, known, np.full(4, 1e-3), []).sentences) == len(verdict.sentences)
+
+
+def torques_of(path: Path, q: NDArray[np.float64], a: NDArray[np.float64]) -> NDArray[np.float64]:
+    """MuJoCo's gravity and inertial torques (2, joints) [N m] of an exported arm at standstill."""
+    engine = mujoco.MjModel.from_xml_path(str(path))
+    engine.opt.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    data = mujoco.MjData(engine)
+    found = []
+    for acceleration in (np.zeros_like(a), a):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, 0.0, acceleration
+        mujoco.mj_inverse(engine, data)
+        found.append(data.qfrc_inverse.copy())
+    return np.stack((found[0], found[1] - found[0]))
+
+
+def test_the_torque_constant_scales_gravity_inertia_and_friction_of_drawn_arms_alike(
+    run: RunFolder, result: SettledResult, tmp_path: Path
+) -> None:
+    source = Source.open(run.path)
+    joints = tuple(replace(joint, torque_per_goal_std=0.1 * joint.torque_per_goal) for joint in source.model.joints)
+    source = replace(source, model=replace(source.model, joints=joints))
+    given, varied = (draw_arms(source, 4, torque_constants=each) for each in (False, True))
+    q, a = np.random.default_rng(3).standard_normal((2, 4))
+    assert np.ptp(varied.torque_factor) > 0.05
+    for number, factor in enumerate(varied.torque_factor.tolist()):
+        paths = [tmp_path / f"{name}_{number}.xml" for name in ("given", "varied")]
+        for path, drawn in zip(paths, (given, varied), strict=True):
+            export_mjcf(replace(source, model=drawn.models[number]), path)
+        before, after = (torques_of(path, q, a) for path in paths)
+        np.testing.assert_allclose(after, factor * before, rtol=2e-3, atol=2e-5)
+        frictions = [ET.parse(path).find(".//joint[@name='joint2']") for path in paths]
+        loss = [0.0 if each is None else float(each.get("frictionloss", 0)) for each in frictions]
+        assert loss[1] == pytest.approx(factor * loss[0])
+
+
+def test_an_arm_without_physically_consistent_links_is_not_exported_silently(
+    run: RunFolder, result: SettledResult, tmp_path: Path
+) -> None:
+    """The names and the size of the difference are in the file and on the terminal; a large one is refused."""
+    source = Source.open(run.path)
+    model = source.model
+    assert isinstance(model, ChainArmModel)
+    stated = dict(model.values)
+    wider = {name: max(std, 0.5 * abs(stated[name])) for name, std in model.stds.items()}
+    least = min((name for name in model.groups if name.startswith("armature")), key=lambda name: stated[name])
+    slightly = replace(source, model=replace(model, values=stated | {least: -0.1 * stated[least]}, stds=wider))
+    left = export_mjcf(slightly, tmp_path / "slightly.xml")
+    found = Written("mjcf", tmp_path / "slightly.xml", left)
+    assert re.search(r"no physically consistent links have the identified values.* differ by .* % \(joint", left[0])
+    assert "is not equivalent to the identified one" in found.warning
+    text = (tmp_path / "slightly.xml").read_text()
+    assert left[0] in text and "NOT dynamically equivalent" in text
+    assert Written("mjcf", run.path, export_mjcf(source, tmp_path / "arm.xml")).warning == ""
+    assert "NOT dynamically equivalent" not in (tmp_path / "arm.xml").read_text()
+    inertias = {name: -value for name, value in stated.items() if name.startswith(("inertia", "armature"))}
+    with pytest.raises(ExportError, match="at most 20 % is exported"):
+        export_mjcf(replace(source, model=replace(model, values=stated | inertias, stds=wider)), tmp_path / "no.xml")
+    assert not (tmp_path / "no.xml").exists()
+
+
+GRAVITY = {"standing": (0.0, 0.0, -1.0), "hanging": (0.0, 0.0, 1.0), "wall": (0.0, 1.0, 0.0)}
+
+
+@pytest.mark.parametrize("assumed", GRAVITY)
+def test_the_mount_with_which_the_recording_agrees_with_the_description_is_found(run: RunFolder, assumed: str) -> None:
+    config = run.load_config()
+    arm, known = described_arm(config), known_chain(config)
+    period = settled_period(config, run.load_facts(), load_samples(run.samples_path, 4), IDENTIFY)
+    chain = replace(known.base.chain, gravity=9.81 * np.array(GRAVITY[assumed]))
+    model = ChainModel(BaseParameters.of(chain))
+    found = better_gravity(period, model, arm.parameters)
+    assert found is None if assumed == "standing" else found == pytest.approx(9.81 * np.array(GRAVITY["standing"]))
+
+
+def test_the_verdict_names_a_mount_and_what_is_still_right(run: RunFolder) -> None:
+    config = run.load_config()
+    known = known_chain(config)
+    estimate = explained(known, 0.01 * known.prior.std)
+    estimate.value = np.where([name == "moment_x_3" for name in known.base.names], -1.0, 1.0) * known.prior.value
+    up = np.array([0.0, 0.0, 9.81])
+    turned = _verdict(config, estimate, known, np.full(4, 1e-3), [], (), up)
+    said = " ".join(turned.sentences)
+    assert turned.trust == "with care"
+    assert "moment_x_3 is -" in said and "joint joint3)" in said and "moment_z_2" not in said
+    assert "hanging upside down, base = [3.1416, 0.0, 0.0]" in said
+    assert "torques at the measured angles are right" in said
+    assert "zero of joint1" not in said, "it turns about the vertical"
+    assert turned.first is not None and turned.first.startswith("set base = [3.1416, 0.0, 0.0]")
+    estimate.systematic = 3.0
+    distorted = _verdict(config, estimate, known, np.full(4, 1e-3), [], (), up)
+    assert distorted.trust == "no" and "distorted as well" in " ".join(distorted.sentences)
+    estimate.systematic = 0.8
+    unknown = _verdict(config, estimate, known, np.full(4, 1e-3), [])
+    said = " ".join(unknown.sentences)
+    assert unknown.trust == "with care" and "none of them agrees better" in said
+    causes = [said.index(each) for each in ("`base`, the orientation", "`direction` and the axis", "90 or 180 degrees")]
+    assert causes == sorted(causes)
+    assert unknown.first is not None and "zero_ticks of joint3" in unknown.first
+    estimate.value = known.prior.value
+    assert _verdict(config, estimate, known, np.full(4, 1e-3), []).first is None
+
+
+def test_the_next_command_is_not_export_if_something_must_be_corrected_first(
+    run: RunFolder, result: SettledResult
+) -> None:
+    doubted = replace(result, verdict=replace(result.verdict, trust="with care", first="set base = [3.1416, 0.0, 0.0]"))
+    first, after = what_next(doubted, run.path).splitlines()
+    assert first == "First set base = [3.1416, 0.0, 0.0]." and after.startswith("Next: hil check ")
+    assert result_from_json(doubted.to_json()).verdict == doubted.verdict
+
+
+def test_only_joints_that_stick_are_said_to_stick() -> None:
+    time = np.arange(2000) / 200.0
+    step = 2.0 * np.pi / 4096
+    moving = 0.3 * np.sin(2.0 * np.pi * 0.3 * time)
+    position = step * np.round(np.stack((moving, np.where(moving > 0.2, 0.2, moving))) / step)
+    assert sticking_joints(position, 200.0, np.full(2, step)) == (1,)
+    position[0, ::50] = np.nan
+    assert sticking_joints(position, 200.0, np.full(2, step)) == (1,)
+    assert "can be the cause" in stopped_short(["elbow"], "Use faster motion")
+    assert "stick" not in stopped_short([], "Use faster motion")

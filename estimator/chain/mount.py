@@ -1,0 +1,123 @@
+"""Does a spatial arm's motion agree with its description, or would it if the base were mounted in another way?
+
+If gravity is assumed to act in the wrong direction, the centres of mass come out on the wrong side of the joints. The
+motion alone may not show it: an arm with one joint moves in the same way if both gravity and its link are reversed. The
+description shows it, since it says on which side the mass is.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.fit.coordinates import kind_of
+from hil.estimator.chain.fit.stage1 import fit_lines
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
+from hil.estimator.data.settled_period import SettledPeriod, without_spikes
+from hil.estimator.errors import EstimationError
+
+MOMENTS = ("moment_x", "moment_y", "moment_z")
+SURE = 4.0  # default number of standard errors by which a moment must differ from zero
+CLEAR = 0.9
+"""Described moment, relative to its uncertainty, above which its sign is taken as known: the described centre of mass
+is about 2 cm or more away from the axis.
+"""
+OPPOSITE = 0.3  # of a described moment: size of a moment of the opposite sign that contradicts it
+
+APART = 0.9  # cosine of the angle between two directions of gravity above which they count as the same
+CLOSER, LESS = 3.0, 2.0
+"""Another direction of gravity is preferred if it divides the squared distance to the description by at least `CLOSER`
+and reduces it by at least `LESS`, in squares of the description's uncertainty.
+"""
+AS_GOOD = 0.02  # permitted mean increase of the logarithm of a joint's torque residual under another direction
+
+
+@dataclass(frozen=True)
+class Opposed:
+    """A moment with the opposite sign of the described one. link: from 1. All values in kg m."""
+
+    name: str
+    value: float
+    std: float
+    expected: float
+
+    @property
+    def link(self) -> int:
+        return int(self.name.rpartition("_")[2])
+
+
+@dataclass(frozen=True)
+class _Agreement:
+    """How one direction of gravity suits the recording and the description.
+
+    residual: mean logarithm of the joints' relative torque residuals. distance: sum of squared deviations of the base
+    parameters from the description, in units of its uncertainty.
+    """
+
+    gravity: Array
+    residual: float
+    distance: float
+
+
+def opposed_moments(
+    names: tuple[str, ...], value: Array, std: Array, prior: Prior, sure: float = SURE
+) -> tuple[Opposed, ...]:
+    """Return the moments that contradict the description in sign; `names` begins with the base parameters.
+
+    sure: number of standard errors by which a moment must differ from zero.
+    """
+    found = []
+    expected = prior.value.tolist()
+    parts = zip(names, value.tolist(), std.tolist(), expected, prior.std.tolist(), strict=False)
+    for name, each, error, described, spread in parts:
+        if kind_of(name) not in MOMENTS or abs(described) < CLEAR * spread:
+            continue
+        if each / described < -OPPOSITE and abs(each) > sure * error:
+            found.append(Opposed(name, each, error, described))
+    return tuple(found)
+
+
+def better_gravity(period: SettledPeriod, model: ChainModel, links: Array) -> Array | None:
+    """Return the direction of gravity with which the recording agrees with the description, although it does not with
+    the assumed direction; None if there is no such direction.
+
+    The result is gravity in the base's frame (3,) [m/s^2]: along one of its axes, or opposite to the assumed one.
+    links: described link parameters (joints, 10) [SI].
+    """
+    assumed = model.base.chain.gravity
+    if not np.any(assumed):
+        return None
+    used = without_spikes(period)
+    try:
+        here = _agreement(used, model, links, assumed)
+        others = [_agreement(used, model, links, each) for each in _directions(assumed)]
+    except EstimationError:
+        return None
+    as_good = [each for each in others if each.residual <= here.residual + AS_GOOD]
+    if not as_good:
+        return None
+    best = min(as_good, key=lambda each: each.distance)
+    nearer = here.distance - best.distance >= LESS and here.distance >= CLOSER * best.distance
+    return best.gravity if nearer else None
+
+
+def _directions(assumed: Array) -> Iterator[Array]:
+    """Yield the directions of gravity to be tried (3,) [m/s^2]: reversed, then along the base's axes."""
+    size = float(np.linalg.norm(assumed))
+    tried = [assumed]
+    for each in (-assumed, *(-size * np.eye(3)), *(size * np.eye(3))):
+        if all(float(each @ other) < APART * size**2 for other in tried):
+            tried.append(each)
+            yield each
+
+
+def _agreement(period: SettledPeriod, model: ChainModel, links: Array, gravity: Array) -> _Agreement:
+    chain = replace(model.base.chain, gravity=gravity)
+    base = BaseParameters.of(chain, tilts=model.base_tilt)
+    prior = Prior.of(base, links)
+    found = fit_lines([period], replace(model, base=base), prior)
+    away = (found.value[: base.count] - prior.value) / prior.std
+    return _Agreement(gravity, float(np.log(found.relative_residual).mean()), float(away @ away))
