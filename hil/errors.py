@@ -159,10 +159,12 @@ class SafetyStop(ExperimentError):
 
     overruled: a servo held goals or settings that this program had not written, so the commanded torque did not cause
     the motion, which therefore reveals nothing about the arm. unheard: whose replies were missing; None if other
-    packets arrived instead. remedy: the last sentences of the message, which may be replaced when more is known.
+    packets arrived instead. doubts_description: the motion contradicts the description of a spatial arm. remedy: the
+    last sentences of the message, which may be replaced when more is known.
     """
 
     overruled = False
+    doubts_description = False
     unheard: Unheard | None = None
 
     def __init__(self, message: str, cause: Cause, remedy: str = "") -> None:
@@ -171,8 +173,8 @@ class SafetyStop(ExperimentError):
         self._remedy = remedy
 
     def replace_remedy(self, remedy: str) -> None:
-        """Replace the last sentences of the message."""
-        self.args = (str(self).replace(self._remedy, remedy),)
+        """Replace the last sentences of the message; if it has none, append these."""
+        self.args = (str(self).replace(self._remedy, remedy) if self._remedy else f"{self} {remedy}",)
         self._remedy = remedy
 
 

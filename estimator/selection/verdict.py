@@ -15,10 +15,12 @@ from hil.estimator.arrays import Array
 from hil.estimator.identify import Estimate
 from hil.estimator.models.bounds import bound_sentence
 from hil.estimator.models.conflicts import Conflict, Trust, conflict_sentences, contradicted
+from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import OPTIONS, kind_of
 from hil.estimator.selection.candidates import Candidate
 from hil.estimator.selection.drift import LEAST, Drift, TorqueChange
 from hil.estimator.selection.validation import Validation
+from hil.estimator.simulation.back_emf import neglected
 
 EXPLAINED = 1.06  # ratio of residual to noise up to which the model explains the motion
 GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # largest prediction error, relative to the motion's RMS
@@ -31,14 +33,23 @@ ALIKE = 0.99  # correlation above which two parameters are hard to separate
 NOTICEABLE = 0.005  # fraction of the residual that a term must explain to be mentioned
 NOISY = 1.25  # ratio of noise to rounding above which the noise is mentioned
 WARM_UP_TIMES, WARM_UP_ROUNDING = 4.0, 30.0  # multiple of the time in which a change was seen; rounded to [s]
+MOSTLY = 0.7  # fraction of a standard error above which one effect determines it
 IMPROVEMENT = {
-    "inertia": "faster motion: raise the upper edge of experiment.band or {torque}",
-    "coupling": "faster motion of both joints together: raise {torque}",
-    "armature": "faster motion of joint 2: raise {own_torque} or the upper edge of experiment.band",
-    "gravity": "a wider swing: raise {torque}, or reduce the lower edge of experiment.band",
-    "viscous": "higher speeds: raise {torque}",
+    "inertia": "faster motion: raise the upper edge of experiment.band or peak_torque",
+    "coupling": "faster motion of both joints together: raise peak_torque",
+    "armature": "faster motion of joint 2: raise its peak_torque or the upper edge of experiment.band",
+    "gravity": "a wider swing: raise peak_torque, or reduce the lower edge of experiment.band",
+    "viscous": "higher speeds: raise peak_torque",
     "coulomb": "more slow reversals: reduce the lower edge of experiment.band, or lengthen the period",
 }
+AT_ITS_LIMIT = {
+    "inertia": "a longer period or faster motion: raise experiment.period or {limit}",
+    "coupling": "a longer period or faster motion of both joints together: raise experiment.period or {limit}",
+    "armature": "a longer period or faster motion of joint 2: raise experiment.period or {limit}",
+    "gravity": "a wider swing: raise {limit}, or reduce the lower edge of experiment.band",
+    "viscous": "higher speeds: raise {limit}",
+}
+"""Improvements if a limit kept the torque from being raised. Higher frequencies would then make the motion smaller."""
 ODD_HINT = "Its residual at odd harmonics indicates friction or ripple that the model lacks."
 EVEN_HINT = (
     "Its residual at even harmonics indicates an effect that depends on direction, or an offset in torque or angle."
@@ -53,6 +64,15 @@ class Verdict:
     trust: Trust
     weakest: str
     sentences: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TorqueLimit:
+    """What kept the pilot from raising the torque."""
+
+    said: str
+    """The setting, in words; if it cannot be raised, a clause that says what limited the torque."""
+    can_be_raised: bool = True
 
 
 @dataclass(frozen=True)
@@ -82,8 +102,8 @@ class Evidence:
     """Other findings that cast no doubt on the values, as sentences."""
     tried_all: bool = False
     """Whether the model was selected from all available terms."""
-    torque_limit: str = ""
-    """The setting that limited the torque, for advice; "" if the user chose peak_torque."""
+    torque_limit: TorqueLimit | None = None
+    """What limited the torque, for advice; None if the user chose peak_torque."""
     conflicts: tuple[Conflict, ...] = field(default=())
     """Values far from those known beforehand."""
     cause: str = ""
@@ -107,7 +127,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
         *((bound_sentence(estimate.at_bound),) if estimate.at_bound else ()),
         *evidence.doubts,
         *evidence.notes,
-        *_weak(validation, evidence.torque_limit),
+        *_weak(estimate, validation, evidence.torque_limit),
         *_alike(validation),
         *_outliers(estimate, explained),
     )
@@ -324,19 +344,35 @@ def percent(part: float) -> str:
     return f"{100.0 * part:.{'2g' if part < 0.995 else '0f'}} %"
 
 
-def improvement_of(name: str, torque_limit: str = "") -> str:
-    """Return advice on improving the estimate of the parameter `name`; torque_limit: as in `Evidence`."""
-    return IMPROVEMENT[kind_of(name)].format(
-        torque=torque_limit or "peak_torque", own_torque=torque_limit or "its peak_torque"
-    )
+def improvement_of(name: str, limit: TorqueLimit | None = None) -> str:
+    """Return advice on improving the estimate of the parameter `name`; limit: as in `Evidence`."""
+    kind = kind_of(name)
+    if limit is None or kind not in AT_ITS_LIMIT:
+        return IMPROVEMENT[kind]
+    if limit.can_be_raised:
+        return AT_ITS_LIMIT[kind].format(limit=limit.said)
+    return f"a longer period: raise experiment.period ({limit.said})"
 
 
-def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
+def _late_back_emf(estimate: Estimate, name: str) -> bool:
+    """Whether the unknown delay between voltage and back-EMF causes most of a parameter's standard error."""
+    floor = neglected(Physics.of(estimate.parameters)).get(name, 0.0)
+    place = estimate.names.index(name)
+    return floor > MOSTLY * float(np.sqrt(estimate.covariance[place, place]))
+
+
+def _weak(estimate: Estimate, validation: Validation, limit: TorqueLimit | None) -> tuple[str, ...]:
     name = validation.weakest
     part = validation.relative_std[name]
     if part <= WELL_KNOWN:
         return (f"The least certain parameter is {name}, known to within {percent(part)}.",)
-    improvement = improvement_of(name, torque_limit)
+    if np.isfinite(part) and _late_back_emf(estimate, name):
+        return (
+            f"The least certain parameter is {name}, known to within {percent(part)}. Most of this is due to the delay "
+            "between the voltage and the motor's back-EMF, which is unknown (0.5 ms). Neither another motion nor a "
+            "longer recording reveals it; only current control, if the servo has it, avoids it.",
+        )
+    improvement = improvement_of(name, limit)
     if not np.isfinite(part):
         return (f"This motion provides no information about {name}. To identify it, use {improvement}.",)
     if part > WEAK and not _is_weak(validation, name):

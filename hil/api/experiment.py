@@ -15,7 +15,7 @@ from hil.clearance.doubts import doubts
 from hil.config.schema import Config
 from hil.drivers.errors import DriverError
 from hil.dry_run.ensemble import earlier_result
-from hil.errors import ConfigError, ExperimentError, RunFolderError, StopRequested
+from hil.errors import ConfigError, ExperimentError, RunFolderError, SafetyStop, StopRequested
 from hil.estimation.after_a_stop import after_a_failure, after_a_stop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
@@ -149,7 +149,14 @@ def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: P
         said = after_a_failure(run, shown) if failed else []
     if said and _is_unsettled(stopped):
         said[-1] = next_step("check", shown)
+    elif said and _doubts_description(stopped):
+        said[-1] = next_step("pose", shown, "--guide")
     return said
+
+
+def _doubts_description(stopped: BaseException) -> bool:
+    stop = stopped if isinstance(stopped, SafetyStop) else stopped.__context__
+    return isinstance(stop, SafetyStop) and stop.doubts_description
 
 
 def _is_unsettled(stopped: BaseException) -> bool:

@@ -11,8 +11,8 @@ from hil.dry_run.ensemble import Ensemble, earlier_result, prior_ensemble, resul
 from hil.dry_run.prediction import predict
 from hil.dry_run.stopping_distance import stopping_distance
 from hil.dry_run.summary import DryRun
-from hil.dry_run.supply_speed import lowered, within_supply
 from hil.plan.plan import make_plan
+from hil.plan.supply_speed import lowered, within_supply
 from hil.setup.idle_bus import quiet_stream
 
 ARMS = 128

@@ -7,6 +7,7 @@ from hil.config.schema import Config
 from hil.estimation.pilot_limit import torque_limit
 from hil.estimation.slips.position_jumps import jump_warnings
 from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.selection.verdict import TorqueLimit
 from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
 
@@ -27,7 +28,7 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
         if steps < LEAST_SWING:
             found.append(
                 f"{joint.name} moved by only {steps:.0f} encoder steps, so rounding errors dominate its parameters; "
-                f"raise {torque_limit(config, samples, index) or 'its peak_torque'}."
+                f"{_more_motion(torque_limit(config, samples, index))}."
             )
         lost = 1.0 - float(np.mean(period.valid[index]))
         if lost > LOST:
@@ -42,6 +43,14 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
                 f"{joint.name}: {100 * lost:.1f} % of the samples are missing or far from their neighbours; {remedy}"
             )
     return found
+
+
+def _more_motion(limit: TorqueLimit | None) -> str:
+    if limit is None:
+        return "raise its peak_torque"
+    if limit.can_be_raised:
+        return f"raise {limit.said}"
+    return f"reduce the lower edge of experiment.band ({limit.said})"
 
 
 def _late_share(config: Config, samples: NDArray[np.void]) -> float:

@@ -47,6 +47,12 @@ bouncing, as a fraction of its speed before the impact.
 WINDOW_S = 0.3
 """Time span [s] for which a message about a stationary joint gives the range of torques."""
 
+_DOUBTS = (
+    "The arm may not be the one described: the direction, zero_ticks or axis of this joint or of another one, or "
+    "arm.base, may be wrong. Move the joints by hand, with torque off, to find out."
+)
+_AGAINST_STOP = "A motor whose direction is wrong may press the joint against the end stop on which it rests."
+
 
 class ChainWatch:
     """Checks every sample against the model.
@@ -147,17 +153,18 @@ class ChainWatch:
             recent = [torque[joint] for at, torque in self._commanded if at.time_before_write >= since]
             said = (
                 f"{name} is not moving, with {min(recent):+.3f} to {max(recent):+.3f} N m commanded in the last "
-                f"{WINDOW_S:g} s: any arm consistent with the prior and the data so far would be moving. "
-                f"{self._blocked_by[joint]}"
+                f"{WINDOW_S:g} s: any arm consistent with the prior and the data so far would be moving."
             )
+            blocked_by = self._blocked_by[joint]
+            causes = f"{_DOUBTS} {_AGAINST_STOP} Otherwise, {blocked_by[0].lower()}{blocked_by[1:]}"
         else:
             self._explain(joint, float(lacking), [state for state, _ in self._commanded])
             said = (
                 f"{name} {UNLIKE_ANY_ARM} consistent with the prior and the data so far: "
-                f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "
-                "encoder has failed, something is pushing or holding it, or the arm is not the one described."
+                f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion."
             )
-        raise SafetyStop(said, Cause.UNEXPECTED)
+            causes = f"{_DOUBTS} Otherwise, its motor or its encoder has failed, or something is pushing or holding it."
+        raise SafetyStop(said, Cause.UNEXPECTED, causes)
 
 
 def observed_parameters(arms: ChainArms) -> tuple[Array, Array]:

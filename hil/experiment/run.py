@@ -24,6 +24,7 @@ from hil.experiment.model_watch import UNLIKE_ANY_ARM
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
+from hil.experiment.wrong_description import doubt_spatial_description
 from hil.plan.chain_plan import check_clearance, plan_of
 from hil.plan.plan import Plan
 from hil.plan.stabiliser import must_balance
@@ -173,6 +174,8 @@ def _play(
         _explain_by_settings(bus, settings, error, stream.modes_seen_ago)
         if not has_moved():
             doubt_description(error, recorder.samples)
+        with suppress(Exception):  # a failing hint must not hide what stopped the arm, or its torque state
+            doubt_spatial_description(config, error, recorder.samples)
         if isinstance(error, DriverError | HilError):
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):

@@ -19,7 +19,7 @@ from hil.description.urdf import parse_urdf
 from hil.estimator.chain.model.tilt import TILT
 from hil.export.actuators import add_actuators
 from hil.export.chain_links import ChainLinks, chain_links, without_movable
-from hil.export.left_out import chain_left_out, torque_constants
+from hil.export.left_out import base_orientation, chain_left_out, torque_constants
 from hil.export.source import Source, write_text
 from hil.export.xml_text import comment, numbers, to_text
 
@@ -60,7 +60,8 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
         dynamics.set("damping", numbers(model.values[f"viscous_{index + 1}"]))
         dynamics.set("friction", numbers(model.values[f"coulomb_{index + 1}"]))
     rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
-    left = [*found.left_out, *rotors, *reduced, *chain_left_out(model), *torque_constants(model)]
+    left = [*found.left_out, *base_orientation(model), *rotors, *reduced]
+    left += [*chain_left_out(model), *torque_constants(model)]
     _describe(root, model, found, left)
     write_text(path, to_text(root))
     return left
@@ -70,7 +71,7 @@ def _export_own_urdf(found: ChainLinks, model: ChainArmModel, path: Path) -> lis
     """Write the URDF of an arm described in MJCF, with its joints, frames and body names."""
     root = ET.Element("robot", name=found.path.stem)
     rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
-    left = [*found.left_out, "the MJCF's shapes", *_held(found), *rotors]
+    left = [*found.left_out, "the MJCF's shapes", *base_orientation(model), *_held(found), *rotors]
     left += [*chain_left_out(model), *torque_constants(model)]
     _describe(root, model, found, left)
     ET.SubElement(root, "link", name=found.arm.base)

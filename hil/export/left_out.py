@@ -1,10 +1,15 @@
 """Model terms that a robot description cannot represent; they are reported in the terminal and in the file."""
 
+import numpy as np
+
 from hil.arm_model import ArmModel
 from hil.chain_model import ChainArmModel
 from hil.estimator.chain.model.late_torque import MEANINGS as LATE
 from hil.estimator.chain.model.tilt import MEANINGS
 from hil.estimator.models.terms import kind_of, term_of
+
+LEVEL = 1e-6
+"""Horizontal component of gravity in the base's frame, relative to gravity, up to which the base counts as upright."""
 
 _SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torque_scale")
 """Terms that need no sentence, because every robot description has them or because `torque_constants` reports them."""
@@ -24,6 +29,18 @@ def chain_left_out(model: ChainArmModel, carried: tuple[str, ...] = ()) -> list[
     elsewhere = {*_SAID_ELSEWHERE, *carried}
     names = [name for name in model.values if name not in model.groups and kind_of(name) not in elsewhere]
     return [_sentence(name, model.values[name]) for name in names]
+
+
+def base_orientation(model: ChainArmModel) -> list[str]:
+    """A sentence if the arm's base is not upright, so that gravity does not act along the base's -z axis."""
+    gravity = model.base_gravity
+    if np.hypot(*gravity[:2]) <= LEVEL * np.linalg.norm(gravity) and gravity[2] <= 0.0:
+        return []
+    x, y, z = (0.0 + np.round(gravity, 3)).tolist()
+    return [
+        f"the orientation of the base: in its frame, gravity is ({x:g}, {y:g}, {z:g}) m/s^2. Mount the arm accordingly "
+        "in the simulator, or set its gravity to this"
+    ]
 
 
 def _sentence(name: str, value: float) -> str:

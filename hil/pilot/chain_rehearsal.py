@@ -7,7 +7,6 @@ from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import ChainDryRun
 from hil.dry_run.resting_stops import resting_stops, said_of_stops
-from hil.dry_run.supply_speed import lowered, within_supply
 from hil.errors import NoSafeTorque
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.estimator.progress import Tell
@@ -17,6 +16,7 @@ from hil.pilot.chain_shares import ARMS, PILOT_SHARES, SafeShares, step_config
 from hil.plan.chain_model import known_chain
 from hil.plan.chain_plan import NoHeadroom, check_rest_pose, make_chain_plan
 from hil.plan.plan import Plan
+from hil.plan.supply_speed import lowered, within_supply
 from hil.setup.idle_bus import quiet_stream
 
 SHOWN = 30

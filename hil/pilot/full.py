@@ -7,7 +7,6 @@ import numpy as np
 
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
-from hil.dry_run.supply_speed import lowered, within_supply
 from hil.errors import DidNotMove, ExperimentError
 from hil.estimation.settled_estimate import estimate_run
 from hil.estimator.arrays import Array
@@ -18,6 +17,7 @@ from hil.pilot.options import PilotOptions
 from hil.pilot.search import Search, with_torque
 from hil.pilot.steps import Played, Player
 from hil.plan.plan import ROLES
+from hil.plan.supply_speed import lowered, within_supply
 from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
 from hil.setup.session.servo_session import Say, servo_session

@@ -15,10 +15,10 @@ from hil.dry_run.prediction import predict
 from hil.dry_run.run import SHOWN, ensemble_of
 from hil.dry_run.stopping_distance import stopping_distance
 from hil.dry_run.summary import DryRun, FirstRun
-from hil.dry_run.supply_speed import lowered, within_supply
 from hil.errors import NoSafeTorque
 from hil.pilot.search import Search
 from hil.pilot.steps import Player
+from hil.plan.supply_speed import lowered, within_supply
 from hil.runs.run_folder import RunFolder
 from hil.setup.idle_bus import quiet_stream
 

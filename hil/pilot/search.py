@@ -13,7 +13,6 @@ import numpy as np
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude, largest_amplitude, most_torque, with_peaks
 from hil.dry_run.prediction import GUARDED, predict
-from hil.dry_run.supply_speed import lowered, slower
 from hil.dry_run.waves import designed_plan, roomy_plan, roomy_plans
 from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimator.arrays import Array, Mask
@@ -25,6 +24,7 @@ from hil.pilot.gains import falls_over, with_stabiliser
 from hil.pilot.options import PilotOptions
 from hil.pilot.steps import Played, Player, Step
 from hil.plan.plan import Plan, scaled
+from hil.plan.supply_speed import lowered, slower
 from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
 

@@ -189,12 +189,14 @@ def _designed(known: KnownChain, config: Config, role: str, seed: int) -> Path:
 
 def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
     peaks, limits = np.abs(thought.of(path)).max(axis=1), torque_limits(config)
+    # Without [joint_path], the path is designed, and its amplitude is searched.
+    where, slower = ("joint_path: ", "lower joint_path.speed or swing, or ") if config.joint_path else ("", "")
     for joint, peak, most in zip(config.joints, peaks.tolist(), limits.tolist(), strict=True):
         if peak > TORQUE_SHARE * most:
             raise NoHeadroom(
-                f"{config.path}: joint_path: {joint.name!r} needs about {peak:.3g} N m for this path, more than "
+                f"{config.path}: {where}{joint.name!r} needs about {peak:.3g} N m for this path, more than "
                 f"{100 * TORQUE_SHARE:.0f} % of its limit of {most:.3g} N m. That leaves too little margin for errors "
-                f"in the described masses: lower joint_path.speed or swing, or raise its {joint.goal_limit_name}."
+                f"in the described masses: {slower}raise its {joint.goal_limit_name}."
             )
 
 

@@ -208,8 +208,8 @@ def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:
         return
     for mode in report.modes:
         yield Finding(Level.OK if mode.sound else Level.WARNING, "bus", mode.name, str(mode))
-    level = Level.STOP if report.fix else Level.WARNING if report.delayed else Level.OK
+    level = Level.STOP if report.fix else Level.WARNING if report.doubt else Level.OK
     found = f"{config.experiment.rate:g} Hz wanted, {report.found}"
-    yield Finding(level, "bus", "rate", found, report.fix or report.delayed)
+    yield Finding(level, "bus", "rate", found, report.fix or report.doubt)
     if seldom:
         yield Finding(Level.WARNING, "bus", "monitoring", "goals and torque are rarely read back", seldom)

@@ -257,8 +257,8 @@ class Lowering:
             return
         raise SafetyStop(
             f"{self._config.joints[joint].joint.title} is speeding up (now {velocity[joint]:+.2f} rad/s) "
-            "although its torque opposes the motion: its motor turns the wrong way or has failed, or something is "
-            "pushing the joint.",
+            "although its torque opposes the motion: its motor turns the wrong way or has failed, something is pushing "
+            "the joint, or the arm is not the one described.",
             Cause.WRONG_SIGN,
         )
 

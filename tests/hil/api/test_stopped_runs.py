@@ -154,6 +154,18 @@ def test_servos_that_are_not_as_before_are_checked_next(
     assert experiment._how_to_go_on(stopped, run, "record", Path("a.toml"))[-1] == f"Next: hil {command} a.toml"
 
 
+def test_after_a_motion_that_contradicts_the_description_the_joints_are_moved_by_hand(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """`hil check` sees neither a direction nor a zero."""
+    monkeypatch.setattr(experiment, "after_a_failure", lambda *_: ["The recording is kept.", "Next: hil check a.toml"])
+    run: Any = None
+    stop = SafetyStop("Joint 'elbow' is not moving.", Cause.UNEXPECTED)
+    for doubts, command in ((False, "check a.toml"), (True, "pose a.toml --guide")):
+        stop.doubts_description = doubts
+        assert experiment._how_to_go_on(stop, run, "identify", Path("a.toml"))[-1] == f"Next: hil {command}"
+
+
 def test_a_bus_failure_before_the_first_sample_ends_with_a_command() -> None:
     run: Any = type("Unused", (), {"discard_if_unused": lambda _: True})()
     stopped = BusShared("Another master")

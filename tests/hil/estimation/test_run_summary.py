@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from hil.cli.views.result_table import _shown
-from hil.config.schema import load_config
+from hil.config.schema import Config, load_config
 from hil.estimation.changes.diff import Difference
 from hil.estimation.pilot_limit import torque_limit
 from hil.estimation.settled_period import scatter
 from hil.estimator.selection.verdict import improvement_of, percent
+from hil.plan.supply_speed import within_supply
 from hil.results.parts import ModelChoice, Quantity, TriedModel
 from hil.runs.recording import sample_type
 from hil.runs.timing import lost_samples
@@ -45,7 +46,26 @@ def test_after_a_pilot_the_advice_names_the_limit(pilot: bool, expected: str) ->
     samples["velocity"][5, 1] = 0.9 * config.joints[1].velocity_limit
     limit = torque_limit(config, samples)
     assert expected in improvement_of("gravity_1", limit)
-    assert ("90 %" in limit) is pilot
+    assert ("90 %" in str(limit)) is pilot
+    assert ("band" in improvement_of("inertia_1", limit)) is not pilot, "beyond a limit, faster waves must be smaller"
+
+
+def test_nobody_is_told_to_raise_a_limit_that_the_supply_lowers() -> None:
+    config = with_high_velocity_limits(load_config(CONFIGS / "xm430_two_link.toml"))
+    samples = some_samples()
+    samples["position"] = config.arm.rest_pose
+    samples["velocity"][5, 1] = 0.9 * within_supply(config).joints[1].velocity_limit
+    limit = torque_limit(config, samples)
+    assert limit is not None and not limit.can_be_raised and "90 %" in limit.said
+    for name in ("inertia_2", "armature_2", "viscous_1", "gravity_1", "coupling"):
+        said = improvement_of(name, limit)
+        assert "raise experiment.period" in said and "velocity_limit" not in said and "band" not in said
+
+
+def with_high_velocity_limits(config: Config) -> Config:
+    joints = [joint.model_copy(update={"velocity_limit": 9.0}) for joint in config.joints]
+    experiment = config.experiment.model_copy(update={"pilot": True})
+    return config.model_copy(update={"joints": joints, "experiment": experiment})
 
 
 def test_a_limit_that_was_far_away_did_not_limit_the_torque() -> None:
@@ -54,8 +74,9 @@ def test_a_limit_that_was_far_away_did_not_limit_the_torque() -> None:
     samples = some_samples()
     samples["position"] = config.arm.rest_pose
     samples["velocity"][5, 1] = 0.25 * config.joints[1].velocity_limit
-    said = torque_limit(config, samples)
-    assert "at most 25 % of any limit" in said and "velocity_limit" not in said
+    limit = torque_limit(config, samples)
+    assert limit is not None and not limit.can_be_raised
+    assert "at most 25 % of any limit" in limit.said and "velocity_limit" not in limit.said
 
 
 def test_large_percentages_and_undetermined_values_are_readable() -> None:

@@ -246,5 +246,8 @@ def test_what_is_said_of_a_joint_at_rest_and_of_one_that_moves(config: Config, w
         sees(config, watch, interval * last, velocity=(0.059, 0.0, 0.0))
     least, most = 0.01 * (last - steps) * constant, 0.01 * (last - 1) * constant
     assert f"with {least:+.3f} to {most:+.3f} N m" in str(stop.value) and stop.value.cause is Cause.UNEXPECTED
+    described, hardware = str(stop.value).split(" Otherwise, ")
+    assert "direction, zero_ticks or axis" in described and "end stop on which it rests" in described
+    assert hardware.startswith("something is blocking it") and "encoder is frozen" in hardware
     with pytest.raises(SafetyStop, match=r"does not move like any arm .*: \+0\.250 N m"):
         sees(config, watch, interval * (last + 1), velocity=(-0.06, 0.0, 0.0))

@@ -16,6 +16,7 @@ from hil.errors import ExportError
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.export import chain_files
 from hil.export.chain_links import ChainLinks, _rotor, _same_groups, chain_links
+from hil.export.left_out import base_orientation
 from hil.plan.chain_model import known_chain
 from tests.support.paths import CONFIGS
 
@@ -79,6 +80,9 @@ def test_a_gripper_keeps_its_inertia_and_the_arm_its_dynamics(
         *(f"torque per goal of {joint.name}" for joint in config.joints),
     ]
     assert "offset_1 = 0.02 N m (constant torque)" in left
+    assert "in its frame, gravity is (1, 1, 1) m/s^2" in left[0] and left[0] in (tmp_path / "out.urdf").read_text()
+    upright: Any = SimpleNamespace(base_gravity=np.array([0.0, 0.0, -9.81]))
+    assert base_orientation(upright) == []
     again = read_urdf(tmp_path / "out.urdf", [joint.name for joint in config.joints])
     for one, other in zip(again.joints, bodies, strict=True):
         np.testing.assert_allclose(one.body.parameters, other.parameters, rtol=1e-9, atol=1e-12)

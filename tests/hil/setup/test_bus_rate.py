@@ -88,3 +88,14 @@ def test_a_rate_is_refused_only_if_it_is_too_high_twice(
     report = check_rate(bus, 400.0)
     assert report.fix.startswith(fix) and bool(report.fix) == bool(fix)
     assert not list(measured)
+
+
+def test_a_rate_that_only_leaves_the_computer_little_time_is_not_refused(tmp_path: Path) -> None:
+    """`hil identify` runs at such a rate, so `hil check` must not call it a blocking problem."""
+    path = six_servos(tmp_path, "1_000_000")
+    possible, _ = rate_of(path)
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("rate = 400", f"rate = {possible + 10}"), encoding="utf-8")
+    (finding,) = [each for each in hil.check(path).findings if each.what == "rate"]
+    assert finding.level == "warning" and f"or {possible} Hz with some margin" in finding.found
+    assert re.search(r"leave only [1-9] % of a period .* at most " + str(possible), finding.fix)

@@ -20,6 +20,9 @@ from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.faults import Fault
 from hil.fakes.description import load_fake
 from hil.fakes.protocol_fake import open_fake
+from hil.plan import chain_plan
+from hil.plan.chain_model import described_torque, known_chain
+from hil.plan.chain_plan import NoHeadroom
 from hil.setup import preflight
 from hil.setup.finding import Finding, Level
 from hil.setup.preflight import check_arm
@@ -177,6 +180,12 @@ def test_check_reports_a_path_that_a_run_would_refuse() -> None:
     weak = [joint.model_copy(update={"current_limit": 0.1}) for joint in spatial.joints]
     (heavy,) = preflight._path(spatial.model_copy(update={"joints": weak}))
     assert heavy.level is Level.STOP and "lower joint_path.speed or swing" in heavy.fix
+    known = known_chain(spatial)
+    thought, path = described_torque(spatial, known), chain_plan._designed(known, spatial, "identify", 1)
+    designed = spatial.model_copy(update={"joints": weak, "joint_path": None})
+    with pytest.raises(NoHeadroom, match="current_limit") as found:
+        chain_plan._check_torque(designed, thought, path)
+    assert "joint_path" not in str(found.value), "the file has no such table"
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hil.config.schema import Config, load_config, parse_config
-from hil.dry_run.supply_speed import lowered, within_supply
 from hil.pilot.supply import delivered_speed
+from hil.plan.supply_speed import lowered, within_supply
 from hil.runs.recording import Phase, sample_type
 from tests.support.paths import CONFIGS
 
