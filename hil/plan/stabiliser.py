@@ -14,6 +14,7 @@ from hil.drivers.state import State
 from hil.errors import ConfigError
 from hil.estimator.arrays import Array
 from hil.estimator.simulation.closed_loop import Feedback
+from hil.plan.chain_rate import chain_too_slow
 from hil.results.parts import StabiliserShare
 
 DELAY_SAMPLES = 1.5
@@ -89,6 +90,8 @@ def too_slow(config: Config) -> str:
     """
     if config.stabiliser is None:
         return ""
+    if config.is_chain:
+        return chain_too_slow(config)
     rate = config.experiment.rate
     for joint, stiffness, damping in zip(
         config.joints, config.stabiliser.stiffness, config.stabiliser.damping, strict=True
