@@ -6,12 +6,12 @@ import numpy as np
 
 from hil.config.chain import base_gravity, described_arm
 from hil.config.schema import Config
-from hil.drivers.servo_prior import servo_prior
 from hil.estimator.arrays import Array
 from hil.estimator.chain.excitation.fourier_path import Path
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.prior import Prior
+from hil.plan.drive_prior import armatures
 
 MOST_ARMATURE = 0.01
 """Largest armature that the feed-forward assumes for a joint [kg m^2]. If too small an armature is assumed, the
@@ -57,13 +57,6 @@ def known_chain(config: Config) -> KnownChain:
     unsure = torque_constant_stds(config)
     prior = Prior.of(base, arm.parameters, scale_std=unsure if unsure.any() else None)
     return KnownChain(base, prior, np.column_stack((arm.parameters, rotors)).reshape(-1))
-
-
-def armatures(config: Config) -> Array:
-    """Armature of each joint (joints,) [kg m^2]: as given in the configuration, or typical of its servos."""
-    if config.arm.prior is not None and config.arm.prior.armature is not None:
-        return np.array(config.arm.prior.armature)
-    return np.array([len(joint.ids) * servo_prior(joint.joint.servo).armature.median for joint in config.joints])
 
 
 def torque_constant_stds(config: Config) -> Array:

@@ -5,11 +5,12 @@ from math import ceil
 import numpy as np
 
 from hil.config.schema import Config, PriorConfig
-from hil.drivers.servo_prior import servo_prior
+from hil.drivers.servo_prior import Guess, servo_prior
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.dynamics import TERMS
 from hil.estimator.chain.simulation.rollout import mass_matrices
-from hil.plan.chain_model import armatures, known_chain
+from hil.plan.chain_model import known_chain
+from hil.plan.drive_prior import low_armatures, low_viscous
 from hil.plan.sampled_loop import SampledLoop
 
 _POSES = 40
@@ -37,26 +38,15 @@ def chain_too_slow(config: Config) -> str:
 def sampled_loop(config: Config) -> SampledLoop:
     """The held joints of an arm that is one standard deviation lighter, and has one less friction, than expected."""
     assert config.stabiliser is not None
-    given = config.arm.prior or PriorConfig()
-    priors = [servo_prior(joint.joint.servo) for joint in config.joints]
-    servos = np.array([len(joint.ids) for joint in config.joints])
-    told = given.armature is not None
-    rotor = [_less(given.spread if told else each.armature.spread) for each in priors]
-    viscous = [_less(each.viscous.spread) * each.viscous.median for each in priors]
-    known = known_chain(config)
-    links = known.described.reshape(-1, TERMS)[:, :-1]
+    known, given = known_chain(config), config.arm.prior or PriorConfig()
+    links = Guess(1.0, given.spread).low * known.described.reshape(-1, TERMS)[:, :-1]
     return SampledLoop(
-        mass_matrices(known.base.chain, _less(given.spread) * links, rotor * armatures(config), _poses(config)),
+        mass_matrices(known.base.chain, links, low_armatures(config), _poses(config)),
         np.array(config.stabiliser.stiffness),
         np.array(config.stabiliser.damping),
-        servos * np.array(viscous),
-        np.array([each.lag.median for each in priors]),
+        low_viscous(config),
+        np.array([servo_prior(joint.joint.servo).lag.median for joint in config.joints]),
     )
-
-
-def _less(spread: float) -> float:
-    """Ratio to its median of a log-normal quantity that is one standard deviation smaller. spread: relative."""
-    return float(np.exp(-np.sqrt(np.log1p(spread**2))))
 
 
 def _poses(config: Config) -> Array:

@@ -109,4 +109,3 @@ def test_a_rate_just_above_the_old_rule_of_thumb_is_refused(tmp_path: Path) -> N
     assert wanted is not None and 50.0 < wanted < 60.0
     found = [each for each in check(tmp_path / "leg.toml").problems if "too low for the stabiliser" in each.fix]
     assert [each.where for each in found] == ["stabiliser"], "said once"
-
