@@ -11,6 +11,7 @@ from hil.dry_run.chain_prediction import loop_of
 from hil.dry_run.chain_prior import prior_arms
 from hil.errors import ConfigError
 from hil.estimator.chain.simulation.rollout import roll_out
+from hil.pilot.chain_paths import chain_config
 from hil.plan.chain_model import known_chain
 from hil.plan.chain_plan import PathSegment, make_chain_plan
 from hil.plan.chain_rate import chain_too_slow, sampled_loop
@@ -78,6 +79,8 @@ def test_a_rate_too_low_for_a_spatial_arm_is_refused_with_one_that_suffices(name
     for low in (20.0, 30.0, rate - 1.0):
         with pytest.raises(ConfigError, match=rf"rate = {low:g} is too low.*Raise the rate to at least {rate} Hz"):
             make_chain_plan(at_rate(config, low))
+        with pytest.raises(ConfigError, match="is too low for the stabiliser"):
+            chain_config(at_rate(config, low))  # with which the pilot begins
     assert make_chain_plan(at_rate(config, rate)).rate == rate
 
 
@@ -87,7 +90,7 @@ def test_every_plausible_arm_keeps_to_its_path_at_the_rate_named_and_is_thrown_a
 ) -> None:
     config = load_config(CONFIGS / f"{name}.toml")
     assert off_the_path(at_rate(config, rate)) < 0.5
-    monkeypatch.setattr("hil.plan.plan.check_rate", lambda _: None)
+    monkeypatch.setattr("hil.plan.chain_plan.check_rate", lambda _: None)
     assert not off_the_path(at_rate(config, 20.0)) < np.pi
 
 
