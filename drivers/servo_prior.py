@@ -7,6 +7,7 @@ the wide spreads.
 """
 
 from dataclasses import dataclass
+from math import exp, log1p, sqrt
 
 from hil.drivers.servo_model import ServoModel
 
@@ -17,6 +18,11 @@ class Guess:
 
     median: float
     spread: float
+
+    @property
+    def low(self) -> float:
+        """Value one standard deviation (of the logarithm) below the median."""
+        return self.median * exp(-sqrt(log1p(self.spread**2)))
 
 
 @dataclass(frozen=True)

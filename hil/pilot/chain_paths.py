@@ -16,6 +16,7 @@ from hil.estimator.progress import Tell
 from hil.plan.chain_model import ChainTorque, known_chain, limit_names, torque_limits
 from hil.plan.chain_plan import check_rest_pose, path_plan
 from hil.plan.plan import HELD_OUT, Plan
+from hil.plan.stabiliser import check_rate
 
 # Highest speed between rest pose and path: the smaller of this [rad/s] and this fraction of velocity_limit.
 RAMP_SPEED = 1.2
@@ -132,7 +133,10 @@ def _peaks(path: Path) -> Array:
 def chain_config(config: Config) -> Config:
     """The configuration with a frequency band, and with a ramp long enough to move slowly to any pose within the
     limits.
+
+    Raises ConfigError if the rate is too low for a configured stabiliser.
     """
+    check_rate(config)
     experiment = config.experiment
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     rest = np.array(config.arm.rest_pose)

@@ -14,19 +14,18 @@ from typing import NoReturn
 import numpy as np
 
 from hil.config.schema import Config, StabiliserConfig
-from hil.drivers.servo_prior import servo_prior
 from hil.errors import ConfigError
 from hil.estimator.arrays import Array, Mask
 from hil.pilot.belief import Belief
+from hil.plan.drive_prior import low_viscous
 from hil.plan.gains import MOST_DAMPING, most_damping
-from hil.plan.stabiliser import DELAY_SAMPLES
+from hil.plan.stabiliser import DELAY_SAMPLES, MOST_DRIVEN
 
 _FREQUENCY = 0.7  # Hz, natural frequency of each joint on its own spring
 _DAMPING_RATIO = 0.35
 _OUTWEIGHS = 1.3  # relative to the largest destabilising gravity stiffness of all arms
 _FRICTIONS_PER_RADIAN = 1.5
-_HELD = 1.5  # ratio of friction to gravity's torque one radian from rest; at 1, friction holds the joint at any angle
-_DRIVEN = 0.8  # largest share of a joint's damping that the delay of its spring may cancel
+_HELD = 1.5  # friction over gravity's torque at one radian from rest: at 1 it holds the joint at any angle
 _TORQUE_SHARE = 0.35  # largest share of the torque limit at a deflection of 1 rad, beyond what gravity needs
 
 
@@ -70,35 +69,35 @@ def proposed(config: Config, belief: Belief, springs: Mask) -> StabiliserConfig:
     spring = np.maximum(inertia * (2 * np.pi * _FREQUENCY) ** 2, _FRICTIONS_PER_RADIAN * friction)
     stiffness = _OUTWEIGHS * away + np.minimum(spring, _TORQUE_SHARE * limit)
     damping = np.maximum(2 * _DAMPING_RATIO * np.sqrt(stiffness * inertia) - viscous, 0.0)
-    usual = np.array([len(joint.ids) * servo_prior(joint.joint.servo).viscous.median for joint in config.joints])
+    low = low_viscous(config)
     lightest = np.min([_free_inertia(config, each) for each in parameters], axis=0)
     stiffness, damping = np.where(springs, stiffness, 0.0), np.where(springs, damping, 0.0)
     least = np.where(springs, _OUTWEIGHS * away, 0.0)
-    spring, damper = _at_rate(config.experiment.rate, stiffness, damping, usual, lightest)
+    spring, damper = _at_rate(config.experiment.rate, stiffness, damping, low, lightest)
     if (weak := spring < least).any():
-        rate = float(_sufficient_rates(damping, least, usual, lightest).max())
+        rate = float(_sufficient_rates(damping, least, low, lightest).max())
         _refuse_rate(config, int(np.argmax(weak)), away, np.ceil(rate))
     return StabiliserConfig(stiffness=_rounded(spring), damping=_rounded(damper))
 
 
-def _at_rate(rate: float, stiffness: Array, damping: Array, usual: Array, lightest: Array) -> tuple[Array, Array]:
+def _at_rate(rate: float, stiffness: Array, damping: Array, friction: Array, lightest: Array) -> tuple[Array, Array]:
     """Return stiffness and damping for a rate [Hz]: as given, or with a stronger damper and, if necessary, a softer
     spring.
 
-    usual: typical viscous friction (joints,) [N m s/rad]. lightest: smallest inertia (joints,) [kg m^2].
+    friction: least expected viscous friction (joints,) [N m s/rad]. lightest: smallest inertia (joints,) [kg m^2].
     """
     delay = DELAY_SAMPLES / rate
-    needed = delay * stiffness / _DRIVEN - usual
+    needed = delay * stiffness / MOST_DRIVEN - friction
     damping = np.maximum(damping, np.minimum(needed, most_damping(rate, lightest)))
-    return np.minimum(stiffness, _DRIVEN * (damping + usual) / delay), damping
+    return np.minimum(stiffness, MOST_DRIVEN * (damping + friction) / delay), damping
 
 
-def _sufficient_rates(damping: Array, least: Array, usual: Array, lightest: Array) -> Array:
+def _sufficient_rates(damping: Array, least: Array, friction: Array, lightest: Array) -> Array:
     """Return each joint's lowest rate (joints,) [Hz] at which `_at_rate` gives the stiffness that gravity requires."""
-    product = DELAY_SAMPLES * least / _DRIVEN  # of rate and damping
+    product = DELAY_SAMPLES * least / MOST_DRIVEN  # of rate and damping
     grown = MOST_DAMPING * lightest  # damping per rate
-    root = np.sqrt(usual**2 + 4.0 * grown * product)
-    return np.asarray(np.minimum((root - usual) / (2.0 * grown), product / (damping + usual)))
+    root = np.sqrt(friction**2 + 4.0 * grown * product)
+    return np.asarray(np.minimum((root - friction) / (2.0 * grown), product / (damping + friction)))
 
 
 def _refuse_rate(config: Config, index: int, away: Array, rate: float) -> NoReturn:

@@ -11,8 +11,13 @@ from hil.estimator.chain.excitation.fourier_path import Path
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.prior import Prior
+from hil.plan.drive_prior import armatures
 
-ARMATURE = 0.01  # kg m^2, assumed by the feed-forward for every joint
+MOST_ARMATURE = 0.01
+"""Largest armature that the feed-forward assumes for a joint [kg m^2]. If too small an armature is assumed, the
+stabiliser supplies the rest; if too large a one is assumed, a light joint is thrown.
+"""
+
 ROUGH_FRICTION = 0.02  # of a joint's largest torque, assumed by the feed-forward
 SLOW = 0.1  # rad/s: width of the transition of the assumed dry friction around zero velocity
 
@@ -48,7 +53,7 @@ def known_chain(config: Config) -> KnownChain:
     """Read the configuration's description. Raises ArmFileError."""
     arm = described_arm(config)
     base = BaseParameters.of(Chain(*arm.geometry, base_gravity(config)), tilts=config.model.base_tilt)
-    rotors = np.full(len(arm.joints), ARMATURE)
+    rotors = np.minimum(MOST_ARMATURE, armatures(config))
     unsure = torque_constant_stds(config)
     prior = Prior.of(base, arm.parameters, scale_std=unsure if unsure.any() else None)
     return KnownChain(base, prior, np.column_stack((arm.parameters, rotors)).reshape(-1))

@@ -23,6 +23,7 @@ from hil.estimator.chain.excitation.fourier_path import Path, design_path
 from hil.estimator.excitation.multisine import Multisine
 from hil.plan.chain_model import ChainTorque, KnownChain, described_torque, known_chain, torque_limits
 from hil.plan.plan import Plan, Segment, make_plan, plan_with
+from hil.plan.stabiliser import check_rate
 
 SETTLE_IN = 0.3  # s over which the feed-forward is faded in and out
 TORQUE_SHARE = 0.8  # fraction of a joint's torque limit that a path may use; the remainder allows for model errors
@@ -79,6 +80,7 @@ def make_chain_plan(config: Config) -> Plan:
     """Design the paths; the same seed gives the same plan. Raises ConfigError."""
     if why := missing_path(config):
         raise ConfigError(f"{config.path}: {why}")
+    check_rate(config)
     known = known_chain(config)
     return path_plan(config, described_torque(config, known), partial(_designed, known))
 

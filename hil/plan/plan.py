@@ -125,12 +125,12 @@ def period_current(config: Config, multisine: Multisine) -> Array:
 
 def make_plan(config: Config) -> Plan:
     """Design the multisines of a planar arm; the same seed gives the same plan."""
+    check_rate(config)
     return plan_with(config, _segment)
 
 
 def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) -> Plan:
     """Make a plan whose segments are designed by `segment`, each for its role and with its own seed."""
-    check_rate(config)
     experiment = config.experiment
     roles = ROLES if experiment.held_out else (IDENTIFY,)
     return Plan(

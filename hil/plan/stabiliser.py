@@ -9,17 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
-from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import ConfigError
 from hil.estimator.arrays import Array
 from hil.estimator.simulation.closed_loop import Feedback
+from hil.plan.chain_rate import chain_too_slow
+from hil.plan.drive_prior import low_viscous
 from hil.results.parts import StabiliserShare
 
 DELAY_SAMPLES = 1.5
 """Mean age of the state on which a torque is based [samples]: the state is one sample old when the torque is sent, and
 the torque is held for another sample.
 """
+
+MOST_DRIVEN = 0.8
+"""Largest fraction of a joint's damping that the delay of its spring may cancel."""
+
+_ROUNDED = 1.01
+"""Tolerance for gains that were chosen for `MOST_DRIVEN` and then rounded."""
 
 INTEGRAL_TIME_S = 1.0
 """Time after which the integral of a constant deviation adds as much current as the spring [s]."""
@@ -85,25 +92,29 @@ def too_slow(config: Config) -> str:
     """Explain why the rate is too low for the stabiliser, and what to do; "" if it is high enough.
 
     A spring whose torque is delayed by `delay` acts like negative damping of magnitude stiffness times `delay`. The
-    joint oscillates unless the configured damping and the servo's typical viscous friction together outweigh it.
+    joint oscillates unless the configured damping and the least viscous friction to be expected of its servos together
+    outweigh it. The damper is delayed too, and the joints are coupled: some of the damping is left for both. For a
+    spatial arm, whose masses are described, the loop itself is analysed.
     """
     if config.stabiliser is None:
         return ""
-    rate = config.experiment.rate
-    for joint, stiffness, damping in zip(
-        config.joints, config.stabiliser.stiffness, config.stabiliser.damping, strict=True
-    ):
-        drives = DELAY_SAMPLES / rate * stiffness
-        damps = damping + len(joint.ids) * servo_prior(joint.joint.servo).viscous.median
-        if drives > damps:
-            return (
-                f"experiment.rate = {rate:g} is too low for the stabiliser of joint {joint.name!r}: its torque is "
-                f"based on a state {1e3 * DELAY_SAMPLES / rate:.0f} ms old. A stiffness of {stiffness:g} N m/rad then "
-                f"acts like a damping of -{drives:.2g} N m s/rad, but the stabiliser and friction together provide "
-                f"only {damps:.2g}. Raise the rate to at least {ceil(rate * drives / damps)} Hz, lower "
-                "stabiliser.stiffness, or raise stabiliser.damping."
-            )
-    return ""
+    if config.is_chain:
+        return chain_too_slow(config)
+    delay = DELAY_SAMPLES / config.experiment.rate
+    stiffness, damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
+    damps = damping + low_viscous(config)
+    shares = delay * stiffness / damps
+    worst = int(np.argmax(shares))
+    if shares[worst] <= _ROUNDED * MOST_DRIVEN:
+        return ""
+    return (
+        f"experiment.rate = {config.experiment.rate:g} is too low for the stabiliser of joint "
+        f"{config.joints[worst].name!r}: its torque is based on a state {1e3 * delay:.0f} ms old. A stiffness of "
+        f"{stiffness[worst]:g} N m/rad then acts like a damping of -{delay * stiffness[worst]:.2g} N m s/rad, but the "
+        f"stabiliser and friction together provide only {damps[worst]:.2g}, of which at most {100 * MOST_DRIVEN:.0f} % "
+        f"may be cancelled. Raise the rate to at least {ceil(config.experiment.rate * shares[worst] / MOST_DRIVEN)} "
+        "Hz, lower stabiliser.stiffness, or raise stabiliser.damping."
+    )
 
 
 def check_rate(config: Config) -> None:

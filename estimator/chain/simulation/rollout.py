@@ -17,6 +17,7 @@ from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS
+from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.kernels import accelerate, invert, move, place, room
 from hil.estimator.compiled import compiled
 
@@ -169,6 +170,23 @@ def weights(arms: ChainArms, pose: Array) -> Array:
     return out
 
 
+def mass_matrices(chain: Chain, link: Array, armature: Array, poses: Array) -> Array:
+    """Mass matrices of one arm in `poses` (poses, joints), (poses, joints, joints) [kg m^2].
+
+    link: inertial parameters (joints, 10). armature: (joints,).
+    """
+    n = chain.joints
+    work, still = room(n), np.zeros(n)
+    rotation, translation, axis, _ = chain.arrays
+    mass = np.empty((len(poses), n, n))
+    link, armature = np.ascontiguousarray(link), np.ascontiguousarray(armature)
+    for pose, matrix in zip(np.ascontiguousarray(poses, dtype=np.float64), mass, strict=True):
+        place(rotation, translation, axis, pose, work[0], work[1])
+        move(link, armature, still, work)
+        matrix[:] = work[4]
+    return mass
+
+
 def inertias(arms: ChainArms, poses: Array) -> tuple[Array, Array]:
     """Return two inertias of each joint, each (arms, joints) [kg m^2].
 
@@ -176,16 +194,9 @@ def inertias(arms: ChainArms, poses: Array) -> tuple[Array, Array]:
     with the other joints free.
     """
     n = arms.base.chain.joints
-    work, still = room(n), np.zeros(n)
-    rotation, translation, axis, _ = arms.base.chain.arrays
     held, free = np.empty((arms.size, n)), np.empty((arms.size, n))
-    mass = np.empty((len(poses), n, n))
     for arm in range(arms.size):
-        link, armature = _split(arms, arm)
-        for pose, matrix in zip(np.ascontiguousarray(poses, dtype=np.float64), mass, strict=True):
-            place(rotation, translation, axis, pose, work[0], work[1])
-            move(link, armature, still, work)
-            matrix[:] = work[4]
+        mass = mass_matrices(arms.base.chain, *_split(arms, arm), poses)
         # Unlike np.sum, np.cumsum rounds a column's sum in the same way, however many columns there are.
         held[arm] = np.cumsum(np.diagonal(mass, axis1=1, axis2=2) / len(poses), axis=0)[-1]
         free[arm] = (1.0 / np.diagonal(linalg.inv(mass), axis1=1, axis2=2)).min(axis=0)

@@ -157,11 +157,11 @@ def test_a_rate_too_slow_for_the_stabiliser_is_refused_with_the_one_that_suffice
     path = tmp_path / "arm.toml"
     path.write_text(replaced(text, ("rate = 400.0", "rate = 20.0"), ("[0.1, 5.0]", "[0.1, 4.0]")), encoding="utf-8")
     config = load_config(path)
-    with pytest.raises(ConfigError, match=r"rate = 20 is too low for the stabiliser of joint 'shoulder'.*at least 44"):
+    with pytest.raises(ConfigError, match=r"rate = 20 is too low for the stabiliser of joint 'shoulder'.*at least 68"):
         make_plan(config)
     found = [each for each in check_arm(config) if each.where == "stabiliser"]
     assert [each.level for each in found] == [Level.STOP]
-    enough = config.model_copy(update={"experiment": config.experiment.model_copy(update={"rate": 45.0})})
+    enough = config.model_copy(update={"experiment": config.experiment.model_copy(update={"rate": 68.0})})
     assert too_slow(enough) == ""
 
 

@@ -37,9 +37,10 @@ SOON_S = 3.0
 """When faults begin in the campaign's run of the arm, whose path is shorter [s]."""
 
 
-def play(folder: Path, text: str, signals: tuple[float, ...] = ()) -> tuple[BaseException, NDArray[np.void]]:
+def play(
+    folder: Path, text: str, signals: tuple[float, ...] = (), urdf: str = "open_manipulator_x_like.urdf"
+) -> tuple[BaseException, NDArray[np.void]]:
     """Run the arm of this text with Ctrl-C at these times [s]; return what ended it and what was recorded."""
-    urdf = "open_manipulator_x_like.urdf"
     (folder / urdf).write_bytes((CONFIGS / urdf).read_bytes())
     (folder / NAME).write_text(text, encoding="utf-8")
     config = load_config(folder / NAME)
@@ -53,7 +54,7 @@ def play(folder: Path, text: str, signals: tuple[float, ...] = ()) -> tuple[Base
 
     with pytest.raises((SafetyStop, StopRequested)) as stopped:
         run_experiment(config, run, config.path, watch)
-    return stopped.value, load_samples(run.samples_path, 4)
+    return stopped.value, load_samples(run.samples_path, len(config.joints))
 
 
 def with_fault(text: str, fault: str) -> str:
@@ -85,6 +86,33 @@ def test_ctrl_c_lowers_the_arm_to_its_rest_pose(tmp_path: Path, monkeypatch: pyt
     assert np.abs(lowered["goal_current"][-1]).max() < 0.1  # the arm does not drop when torque is cut
     assert np.abs(lowered["velocity"][round(0.3 * RATE) :]).max() < 1.0  # braked, then slowly
     assert len(lowered) / RATE < 12.0
+
+
+KOCH = """
+[joint_path]
+centre = [0.0, -1.1, 1.1, 0.1, 0.0]
+swing = [0.8, 0.25, 0.2, 0.25, 1.2]
+speed = [2.0, 1.2, 1.2, 1.2, 3.0]
+
+[stabiliser]
+stiffness = [2.69, 3.35, 0.723, 0.227, 0.304]
+damping = [0.163, 0.177, 0.0315, 0.0093, 0.0127]
+
+[experiment]
+"""
+
+
+@pytest.mark.parametrize("at", [3.0, 4.0, 5.0])
+def test_the_brake_does_not_throw_a_light_wrist_at_a_low_rate(tmp_path: Path, at: float) -> None:
+    """Its first torque acts for a whole sample: with too heavy a rotor assumed, it reversed the wrist at 7 rad/s."""
+    text = (CONFIGS / "koch.toml").read_text(encoding="utf-8")
+    text = "".join(line for line in text.splitlines(keepends=True) if not line.startswith("pilot = true"))
+    slow = ("rate = 400.0", "rate = 80.0"), ("period = 10.0", "period = 4.0"), ("band = [0.1", "band = [0.25")
+    text = replaced(text, ("[experiment]\n", KOCH), *slow)
+    error, samples = play(tmp_path, text, (at,), "koch_like.urdf")
+    braked = samples[samples["phase"] == Phase.LOWERING]
+    assert any("lowered to its rest pose" in note for note in error.__notes__)
+    assert np.abs(braked["velocity"]).max() < 2.5
 
 
 def test_an_arm_off_its_rest_pose_starts_and_ends_where_it_lies(tmp_path: Path) -> None:
@@ -249,7 +277,7 @@ def test_an_arm_that_does_not_lie_where_the_file_says_is_named_before_torque(tmp
     run = RunFolder.create(tmp_path / "run", config)
     with pytest.raises(ExperimentError, match=r"'joint3'.*arm\.rest_pose"):
         run_experiment(config, run, config.path, lambda _: None)
-    assert not run.samples_path.exists() or not len(load_samples(run.samples_path, 4))
+    assert not run.samples_path.exists() or not len(load_samples(run.samples_path, len(config.joints)))
 
 
 def test_cut_as_configured(tmp_path: Path) -> None:
