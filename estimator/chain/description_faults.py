@@ -98,8 +98,14 @@ class Motion:
     def before(self) -> "Motion":
         """The motion without its last `LATEST_S`."""
         kept = self.time >= LATEST_S
-        arrays = (self.position, self.velocity, self.acceleration, self.torque)
-        return Motion(*(each[:, kept] for each in arrays), self.is_free[:, kept], self.time[kept])
+        return Motion(
+            self.position[:, kept],
+            self.velocity[:, kept],
+            self.acceleration[:, kept],
+            self.torque[:, kept],
+            self.is_free[:, kept],
+            self.time[kept],
+        )
 
     def changed(self, change: Change) -> "Motion":
         """The motion in the angles of the changed description."""
