@@ -35,11 +35,11 @@ from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
 from hil.setup.bus_rate import seldom_read_back
 from hil.setup.changed_settings import EXPLAINED, WRITTEN, Settings, changed_settings, may_be_later, settings_now
-from hil.setup.lying import from_where_it_lies, moved_without_torque, said_of_the_rest, tolerance_now, wait_for_rest
+from hil.setup.lying import from_where_it_lies, moved_without_torque, said_of_the_rest, tolerance_now
 from hil.setup.realtime import on_time
 from hil.setup.session.end_of_session import about_torque, confirmed_later
 from hil.setup.session.servo_session import REBOOT_S, has_moved, lay_at_start, servo_session, settings_at_start
-from hil.setup.unmoved import Lies, has_stirred, refuse_moved, where_it_lies
+from hil.setup.unmoved import Lies, has_stirred, refuse_moved, wait_for_rest, where_it_lies
 
 __all__ = ["run_experiment"]
 
