@@ -23,6 +23,9 @@ FADE_S = 1.0
 SINKING_S = 20.0
 """Longest time for which joints may sink, braked by their motors, before torque is cut [s]."""
 
+HALF_DOWN = "The arm was being let down; its torque was left on"
+"""Beginning of the note on an exception that ends the sinking early."""
+
 _STEPS = 20
 _LOOK_S = 0.05
 """Interval at which positions and goals are read while the arm sinks [s]."""
@@ -107,8 +110,8 @@ def let_sink(held: Mapping[Joint, Servo], clock: Clock, originals: Originals | N
     except BaseException as ended:
         if lowered := lowering.lowered:
             ended.add_note(
-                f"The arm was being let down; its torque was left on, with lowered goals: {lowered}. Hold the arm by "
-                "hand and start again with --take-over, which lets it down completely."
+                f"{HALF_DOWN}, with lowered goals: {lowered}. Hold the arm by hand and start again with --take-over, "
+                "which lets it down completely."
             )
         raise
     lowering.cut()
@@ -126,7 +129,7 @@ class _Lowering:
         self._written: dict[tuple[Joint, str], int] = {}
 
     def run(self) -> tuple[Joint, ...]:
-        """Reduce the output to zero, wait until the joints are still, and return those that still move after SINKING_S."""
+        """Reduce the output to zero, wait until the joints are still, and return those still moving after SINKING_S."""
         for servo in self._held.values():
             if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
                 servo.write("Bus Watchdog", 0)  # tripped, it locks the goals

@@ -125,9 +125,10 @@ class ServoSession:
         """Save the settings of servos that are about to be let down, and announce what will happen."""
         originals = self.saved.save_held(joints)
         self._say(
-            f"Torque is on at {and_list(map(str, joints))}. It is reduced to zero within {FADE_S:.0f} s; the arm then "
-            f"sinks, braked by its motors, until it comes to rest, and torque is cut, after {SINKING_S:.0f} s at the "
-            "latest. Hold the arm by hand: whether a real motor brakes with a goal of zero has not been tested."
+            f"Torque is on at {and_list(map(str, joints))}. The arm is let down: within {2 * FADE_S:.0f} s, its "
+            f"motors' output is reduced to zero; it then sinks, braked by its motors, for at most {SINKING_S:.0f} s, "
+            "and torque is cut when it has come to rest. Hold the arm by hand: whether a real motor brakes in this way "
+            "has not been tested."
         )
         if unbraked := in_current_mode({joint: self.bus.drives[joint] for joint in joints}):
             self._say(

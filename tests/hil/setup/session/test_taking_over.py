@@ -18,7 +18,7 @@ from hil.setup.unmoved import MOST_RAD, where_it_lies
 from tests.support.bench import SHORT, Arm, Bench
 
 GOAL_PWM = 600
-SERVO_1, SERVO_2 = (f'[[fake.servos]]\nid = {each}\n' for each in (1, 2))
+SERVO_1, SERVO_2 = (f"[[fake.servos]]\nid = {each}\n" for each in (1, 2))
 
 
 def taking_over(config: Config) -> Config:
