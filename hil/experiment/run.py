@@ -105,9 +105,10 @@ def run_experiment(
             config, plan = _from_where_it_lies(config, plan, bus, run, note)
         if seldom := seldom_read_back(bus, bus.prepared, bus.port.off_wire):
             note(seldom)
+        run.refuse_lost()
         _write_facts(config, run, plan, bus, shown_path, seldom)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
-            run.refuse_lost()  # the recorder has read by now what it would save again
+            run.refuse_lost()  # from now on, the recorder can save the files again
             # Signals are deferred from before torque comes on until the servos' settings are restored.
             with stop.only_noted(), servo_limits(config, bus, note):
                 changed = _play(config, plan, bus, recorder, stop, shown, note, arms, lies)

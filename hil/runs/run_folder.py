@@ -150,8 +150,8 @@ class RunFolder:
         if gone := [each.name for each in self._written if not each.is_file()]:
             lost = RunFolderError(
                 f"Run folder {self.path} was removed or renamed while the run was being prepared: {gone[0]} is no "
-                "longer there. Torque has not been switched on and nothing has been recorded. Start again, and leave "
-                "the folder in place until the command ends."
+                "longer there. Torque was not switched on for this run, and nothing of it has been recorded. Start "
+                "again, and leave the folder in place until the command ends."
             )
             lost.exit_code = 1  # the input was valid
             raise lost

@@ -109,10 +109,10 @@ class SavedSettings:
         except RunFolderError as error:
             ours = ("Goal PWM", "Goal Current") if was_held else ("Operating Mode", "Current Limit")
             values = ", ".join(f"{name} {settings[name]}" for name in ours if name in settings)
+            copy = "" if was_held else f" For all settings, see {settings_file.COPY_NAME} in the run folder."
             self._say(
                 f"The settings of {joint} cannot be saved where the next run would find them: {error} If this program "
-                f"is killed, set them again by hand: {values}. For all settings, see {settings_file.COPY_NAME} in the "
-                "run folder."
+                f"is killed, set them again by hand: {values}.{copy}"
             )
             return Kept(url, joint.id, model, settings, changed, 0, "", was_held=was_held)
 

@@ -74,7 +74,8 @@ def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
     if half_down:
         yield (
             f"The settings of {and_list(map(str, half_down))} from before the arm was taken over are in "
-            f"{_where([saved.left[joint].path for joint in half_down])}; the next start with --take-over restores them."
+            f"{_where([saved.left[joint].path for joint in half_down])}. The next start with --take-over restores "
+            "them; if the servos are switched off and on, `hil check` does so, too."
         )
     for why, joints in by_reason(waiting).items():
         paths = [saved.left[joint].path for joint in joints]

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from hil.config.schema import Config
-from hil.drivers.errors import BusShared, TorqueHeld
+from hil.drivers.errors import BusShared, NoReply, TorqueHeld
 from hil.drivers.servo import Servo
 from hil.drivers.torque import held
 from hil.setup.finding import Level
@@ -97,7 +97,7 @@ def test_a_second_take_over_does_not_take_lowered_goals_for_the_original_ones(
             pass
         said = "\n".join(stopped.value.__notes__)
         assert f"Goal PWM of ID 2, originally {GOAL_PWM}" in said and "--take-over" in said
-        assert "an earlier run left" not in said
+        assert "an earlier run left" not in said and "TORQUE IS ON" in said
         assert all(servo.torque_enabled and servo.value("Goal PWM") < GOAL_PWM for servo in bench.servos.values())
         assert len(on_file()) == 2
     with servo_session(config):
@@ -242,3 +242,21 @@ def test_an_arm_that_still_sinks_when_its_torque_is_cut_is_first_read_at_rest(
         first, now = lay_at_start(), where_it_lies(bus)
     assert all(abs(now[drive] - first[drive]) * abs(drive.position_unit) < MOST_RAD for drive in now)
     assert "Joint 'shoulder' (ID 1, XM430-W350)" in capsys.readouterr().err
+
+
+def test_a_servo_that_does_not_answer_does_not_hide_the_torque_of_the_others(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.prepare = hold
+    read = Servo.read
+
+    def one_silent(servo: Servo, register: str, attempts: int = 3) -> int:
+        if servo.id == 1 and servo.read_despite_error("Goal PWM") < GOAL_PWM:
+            raise NoReply(f"{servo.title} does not answer.")
+        return read(servo, register, attempts)
+
+    monkeypatch.setattr(Servo, "read", one_silent)
+    with pytest.raises(NoReply) as ended, servo_session(taking_over(arm(SHORT))):
+        pass
+    said = "\n".join(ended.value.__notes__)
+    assert "TORQUE IS ON at Joint 'elbow'" in said and "could not read whether it is off at Joint 'shoulder'" in said
