@@ -66,7 +66,7 @@ def about_leftovers(servo: Servo) -> Leftovers | None:
     try:
         if told := half_let_down(kept, servo):
             again = _taking_over(kept, port)
-            return Leftovers(f"{told[:1].upper()}{told[1:]} {where}", again, "half let down by a killed run")
+            return Leftovers(f"{told[:1].upper()}{told[1:]} {where}", again, "half let down by an earlier run")
         differing = what_is_left(kept, servo, read_settings(servo)).differing
         was_left_on, is_on = is_left_on(servo, kept), bool(servo.read("Torque Enable"))
     except PortLost:

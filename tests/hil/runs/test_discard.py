@@ -7,6 +7,7 @@ import pytest
 
 from hil.config.schema import Config
 from hil.drivers.torque.switch import TorqueSwitch
+from hil.errors import RunFolderError
 from hil.experiment import run
 from hil.runs.run_folder import RunFolder
 from tests.support.command_line import hil
@@ -52,6 +53,22 @@ def test_a_folder_that_is_lost_before_the_run_is_noticed_before_torque_is_on(
     said = " ".join(capsys.readouterr().err.split())
     assert f"{out} was removed or renamed" in said and "Torque is off" in said
     assert not out.exists()
+
+
+def test_a_folder_without_a_recording_that_cannot_be_removed_is_not_said_to_hold_one(
+    arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = arm_file(*QUICK)
+    out = path.parent / "run"
+
+    def full(*_: object) -> None:
+        raise RunFolderError(f"{out}/run.json cannot be written: Read-only file system.")
+
+    monkeypatch.setattr(run, "_write_facts", full)
+    monkeypatch.setattr("shutil.rmtree", lambda *_, **__: None)
+    assert hil("record", path, "--out", out) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "Nothing was recorded" in said and "kept" not in said and f"Next: hil check {path}" in said
 
 
 def test_what_was_recorded_stays(identified: Path) -> None:
