@@ -43,7 +43,7 @@ def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
 
 def _nothing_recorded(run: RunFolder, shown: Path) -> list[str]:
     """Say that a folder without a recording or result is still there; nothing if it holds either."""
-    if run.result_path.is_file() or any(run.path.rglob(run.samples_path.name)):
+    if run.result_path.is_file() or run.samples_path.is_file() or _steps(run.path):
         return []
     return [
         f"Nothing was recorded, but {run.path} could not be removed: check that its disk is writable.",
