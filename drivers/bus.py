@@ -1,7 +1,7 @@
 """Prepares one arm's servos on one port and runs their control cycle; `hil.drivers.torque` switches their torque."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 from hil.drivers.control_table import load_control_table, model_names
@@ -24,7 +24,7 @@ from hil.drivers.servo import Servo
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, with_article
 from hil.drivers.state import NAN, SETTINGS, Converter, State, fold, read_back_spans, spans
 from hil.drivers.sync_read import Answer, Span, SyncRead
-from hil.drivers.torque.held import let_sink, refuse_held
+from hil.drivers.torque.held import LetDown, Originals, held_servos, let_sink, refuse_held
 from hil.drivers.torque.switch import TorqueSwitch
 
 __all__ = ["CHECK_S", "BusConfig", "ServoBus"]
@@ -187,21 +187,28 @@ class ServoBus(TorqueSwitch):
             )
         self._without_watchdog.add(joint)
 
-    def release_held(self, ours: Collection[Joint] = ()) -> None:
+    def release_held(
+        self, ours: Collection[Joint] = (), before_lowering: Callable[[Collection[Joint]], Originals] | None = None
+    ) -> LetDown:
         """Ensure that every servo's torque is off before anything is written.
 
-        If it is not, raises TorqueHeld, or lets the arm sink if `BusConfig.take_over` is set.
+        If it is not, raises TorqueHeld, or lets the arm sink if `BusConfig.take_over` is set (`let_sink`).
         ours: joints whose torque was left on by a program that this user ran earlier; that torque is cut immediately.
+        before_lowering: called with the joints that are about to be let down, before anything is written to their
+        servos; returns the `originals` of `let_sink`.
         """
         for joint in ours:
             if self._servos[joint].read("Torque Enable"):
                 self._servos[joint].write("Torque Enable", 0)
-        if self.config.take_over:
-            let_sink(self._servos, self.port.clock)
+        down = LetDown()
+        if self.config.take_over and (held := held_servos(self._servos)):
+            originals = None if before_lowering is None else before_lowering(held)
+            down = let_sink(held, self.port.clock, originals)
         refuse_held(self._servos)
         for servo in self._servos.values():
             if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED and servo.read("Torque Enable"):
                 servo.write("Torque Enable", 0)  # if torque is on after this, another program has switched it on
+        return down
 
     def prepare(self) -> None:
         """Set every servo's mode with torque off, and prepare the exchange.

@@ -1,9 +1,16 @@
-"""Handling of torque that is already on at the start: either refuse to start, or let the arm sink slowly."""
+"""Handling of torque that is already on at the start: either refuse to start, or let the arm sink slowly.
 
-from collections.abc import Iterable, Mapping
+To let it sink, Goal PWM is reduced to zero, which limits the motor's output in every operating mode (ROBOTIS e-Manual,
+Goal PWM). With zero PWM and torque on, the motor's terminals are shorted, so it brakes. In current mode, Goal Current
+is then reduced to zero too, in case a servo's firmware ignores Goal PWM in that mode.
+"""
+
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from typing import NamedTuple
 
 from hil.drivers.clock import Clock
-from hil.drivers.errors import TorqueHeld
+from hil.drivers.errors import BusShared, DriverError, ServoRefused, TorqueHeld
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import Servo
@@ -13,11 +20,31 @@ from hil.drivers.torque.off import has_torque, signals_held_back
 FADE_S = 1.0
 """Time over which a held servo's output limit is reduced to zero [s]."""
 
-SINKING_S = 4.0
-"""Maximum time for which joints may sink, braked by their motors, before torque is cut [s]."""
+SINKING_S = 20.0
+"""Longest time for which joints may sink, braked by their motors, before torque is cut [s]."""
+
+HALF_DOWN = "The arm was being let down; its torque was left on"
+"""Beginning of the note on an exception that ends the sinking early."""
 
 _STEPS = 20
-_STILL_TICKS = 2  # Present Velocity below which a joint counts as still
+_LOOK_S = 0.05
+"""Interval at which positions and goals are read while the arm sinks [s]."""
+
+_STILL_S, _STILL_TICKS = 0.5, 6
+"""A joint whose Present Position changes by at most `_STILL_TICKS` within `_STILL_S` [s] counts as still."""
+
+
+Originals = Mapping[Joint, Mapping[str, int]]
+"""Each servo's settings, by name [ticks], before any program began to let the arm down."""
+
+
+class LetDown(NamedTuple):
+    """What was done about torque that was on: the joints that were let down, and those of them that were still moving
+    when their torque was cut.
+    """
+
+    joints: tuple[Joint, ...] = ()
+    moving: tuple[Joint, ...] = ()
 
 
 def is_held(servo: Servo) -> bool:
@@ -32,10 +59,19 @@ def is_held(servo: Servo) -> bool:
     return not (tripped and servo.read("Operating Mode") in (Mode.CURRENT, Mode.PWM))
 
 
+def held_servos(servos: Mapping[Joint, Servo]) -> dict[Joint, Servo]:
+    """The servos whose joints are held. Raises the errors of `Servo.read`."""
+    return {joint: servo for joint, servo in servos.items() if is_held(servo)}
+
+
+def in_current_mode(servos: Mapping[Joint, Servo]) -> list[Joint]:
+    """The joints whose servos are in current mode. Raises the errors of `Servo.read`."""
+    return [joint for joint, servo in servos.items() if servo.read("Operating Mode") == Mode.CURRENT]
+
+
 def refuse_held(servos: Mapping[Joint, Servo]) -> None:
     """Raise TorqueHeld if any joint is held. Also raises the errors of `Servo.read`."""
-    held = [joint for joint, servo in servos.items() if is_held(servo)]
-    if held:
+    if held := held_servos(servos):
         raise TorqueHeld(
             f"{' and '.join(joint.title for joint in held)}: torque is on, so another program is driving or holding "
             "the arm, or has left torque on. Switching it off would let the arm fall, so nothing was written. Stop "
@@ -56,48 +92,133 @@ def _current(joint: Joint, servo: Servo) -> str:
     return f" (Present Current {servo.read('Present Current') * joint.servo.current_unit:.3f} A)"
 
 
-def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
+def let_sink(held: Mapping[Joint, Servo], clock: Clock, originals: Originals | None = None) -> LetDown:
     """Ramp the output of held servos down to zero, wait until the joints no longer sink, then cut torque and restore
-    the goals that limited their output.
+    the goals that limited their output to their present values.
 
-    With zero PWM and torque on, the motor's terminals are shorted, so it brakes. Raises the errors of `Servo.write`; if
-    an exception ends the sinking early, a note added to it lists the goals that remain lowered, since restoring them
-    with torque on would jerk the arm back up.
+    originals: settings to name in messages; an earlier program may already have lowered the present goals.
+    Raises the errors of `Servo.write`. An exception that ends the sinking early gets a note on the goals that are left
+    lowered, since restoring them with torque on would jerk the arm back up. Only if another program raises the lowered
+    goals again is torque cut first, since the arm would otherwise be driven; raises BusShared.
     """
-    held = [servo for servo in servos.values() if is_held(servo)]
-    names = [_what_drives(servo) for servo in held]
-    goals = [(servo, name, servo.read(name)) for servo, name in zip(held, names, strict=True)]
-    is_lowered = False
+    lowering = _Lowering(held, clock, originals or {})
     try:
-        for step in range(1, _STEPS + 1):
-            clock.wait_until(clock.now() + FADE_S / _STEPS)
-            for servo, name, begun in goals:
-                is_lowered = True
-                servo.write(name, round(begun * (1 - step / _STEPS)))
-        until = clock.now() + SINKING_S
-        while held and clock.now() < until:
-            clock.wait_until(clock.now() + 0.1)
-            if all(abs(servo.read("Present Velocity")) <= _STILL_TICKS for servo in held):
-                break
-    except BaseException as ended:
-        if is_lowered:
-            ended.add_note(_lowered(goals))
+        moving = lowering.run()
+    except BusShared:
+        lowering.cut_despite_others()
         raise
-    with signals_held_back():
-        for servo in held:
-            servo.write("Torque Enable", 0)
-        for servo, name, begun in goals:
-            servo.write(name, begun)
+    except BaseException as ended:
+        if lowered := lowering.lowered:
+            ended.add_note(
+                f"{HALF_DOWN}, with lowered goals: {lowered}. Hold the arm by hand and start again with --take-over, "
+                "which lets it down completely."
+            )
+        raise
+    lowering.cut()
+    return LetDown(tuple(held), moving)
 
 
-def _lowered(goals: Iterable[tuple[Servo, str, int]]) -> str:
-    listed = ", ".join(f"{name} of ID {servo.id}, which was {begun}" for servo, name, begun in goals)
-    return (
-        f"The arm was being lowered slowly and has been left with a reduced {listed}. Hold the arm by hand, switch "
-        "its torque off and set this again with DYNAMIXEL Wizard 2.0, or start again with --take-over."
-    )
+class _Lowering:
+    """The output of held servos, reduced step by step."""
 
+    def __init__(self, held: Mapping[Joint, Servo], clock: Clock, originals: Originals) -> None:
+        self._held = held
+        self._clock = clock
+        self._originals = originals
+        self._former: dict[tuple[Joint, str], int] = {}
+        self._written: dict[tuple[Joint, str], int] = {}
 
-def _what_drives(servo: Servo) -> str:
-    """Return the name of the goal that limits the motor's output in the servo's present mode."""
-    return "Goal Current" if servo.read("Operating Mode") == Mode.CURRENT else "Goal PWM"
+    def run(self) -> tuple[Joint, ...]:
+        """Reduce the output to zero, wait until the joints are still, and return those still moving after SINKING_S."""
+        for servo in self._held.values():
+            if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
+                servo.write("Bus Watchdog", 0)  # tripped, it locks the goals
+        self._fade("Goal PWM", self._held)
+        self._fade("Goal Current", in_current_mode(self._held))
+        return self._wait_until_still()
+
+    def _fade(self, name: str, joints: Collection[Joint]) -> None:
+        if not joints:
+            return
+        begun = {joint: self._held[joint].read(name) for joint in joints}
+        self._former |= {(joint, name): goal for joint, goal in begun.items()}
+        self._written |= {(joint, name): goal for joint, goal in begun.items()}
+        for step in range(1, _STEPS + 1):
+            self._clock.wait_until(self._clock.now() + FADE_S / _STEPS)
+            self._refuse_rewritten()
+            for joint, goal in begun.items():
+                self._write(joint, name, round(goal * (1 - step / _STEPS)))
+
+    def _wait_until_still(self) -> tuple[Joint, ...]:
+        until = self._clock.now() + SINKING_S
+        since = dict.fromkeys(self._held, self._clock.now())
+        before = self._positions()
+        while (now := self._clock.now()) < until:
+            self._clock.wait_until(now + _LOOK_S)
+            self._refuse_rewritten()
+            for joint, position in self._positions().items():
+                if abs(position - before[joint]) > _STILL_TICKS:
+                    before[joint], since[joint] = position, self._clock.now()
+            if self._clock.now() - max(since.values()) >= _STILL_S:
+                return ()
+        return tuple(joint for joint, last in since.items() if self._clock.now() - last < _STILL_S)
+
+    def _positions(self) -> dict[Joint, int]:
+        return {joint: servo.read("Present Position") for joint, servo in self._held.items()}
+
+    def _write(self, joint: Joint, name: str, value: int) -> None:
+        former = self._written[joint, name]
+        self._written[joint, name] = value
+        try:
+            self._held[joint].write(name, value)
+        except ServoRefused:
+            self._refuse_rewritten(either=former)
+            raise
+
+    def _refuse_rewritten(self, either: int | None = None) -> None:
+        """Raise BusShared if a servo with torque on holds a goal that this program did not write.
+
+        A servo whose torque is off has been rebooted, or another program has released it; a tripped Bus Watchdog has
+        zeroed its goal. either: a value that a goal may hold as well, since the latest write may have been lost.
+        """
+        for (joint, name), written in self._written.items():
+            servo = self._held[joint]
+            if servo.read(name) == written or (found := servo.read_surely(name)) in (written, either):
+                continue
+            if servo.read("Torque Enable") and servo.read("Bus Watchdog") != WATCHDOG_TRIPPED:
+                raise BusShared(
+                    f"{joint.title}: while the arm was being let down, {name} was lowered to {written}, but reads "
+                    f"{found}: another program is driving the arm. Torque was cut before the arm had come to rest, so "
+                    "that it was not driven on. End that program, or unplug its controller, then start again."
+                )
+
+    @property
+    def lowered(self) -> str:
+        """The goals that have been lowered, each with its original value; "" if none has."""
+        originals = {
+            (joint, name): self._originals.get(joint, {}).get(name, former)
+            for (joint, name), former in self._former.items()
+        }
+        return ", ".join(
+            f"{name} of ID {joint.id}, originally {original}"
+            for (joint, name), original in originals.items()
+            if self._written[joint, name] != original
+        )
+
+    def cut(self) -> None:
+        """Cut torque, then restore the goals. Raises the errors of `Servo.write`."""
+        with signals_held_back():
+            for servo in self._held.values():
+                servo.write("Torque Enable", 0)
+            for (joint, name), former in self._former.items():
+                self._held[joint].write(name, former)
+
+    def cut_despite_others(self) -> None:
+        """Cut torque and restore the goals as far as another program permits."""
+        with signals_held_back():
+            for servo in self._held.values():
+                with suppress(DriverError):
+                    servo.write_despite_error("Torque Enable", 0)
+            for (joint, name), former in self._former.items():
+                with suppress(DriverError):
+                    self._held[joint].write_despite_error(name, former)

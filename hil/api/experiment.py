@@ -14,6 +14,7 @@ from hil.api.run import Identification, Run, identification, load_run
 from hil.clearance.doubts import doubts
 from hil.config.schema import Config
 from hil.drivers.errors import DriverError
+from hil.drivers.torque.held import HALF_DOWN
 from hil.dry_run.ensemble import earlier_result
 from hil.errors import ConfigError, ExperimentError, RunFolderError, SafetyStop, StopRequested
 from hil.estimation.after_a_stop import after_a_failure, after_a_stop
@@ -49,8 +50,8 @@ def identify(
     Args:
         config: TOML file of the arm, the name of a bundled one such as "fake_two_link", or a loaded configuration.
         out: run folder, which must be new or empty; by default runs/TIME-ARM.
-        take_over: take over an arm that another program left with its torque on, and lower it slowly. Support the arm
-        by hand meanwhile.
+        take_over: take over an arm that another program left with its torque on, and let it sink, braked by its
+            motors, for at most 20 s; support it by hand.
         start_from: run folder or result.json of an earlier identification of the same arm. It replaces the prior,
             so that fewer runs are needed; requires experiment.pilot. If the arm does not move as that result predicts,
             the prior is used.
@@ -178,6 +179,8 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
                 # If another program replaced the folder, the error says where the samples are.
                 for line in _how_to_go_on(stopped, run, command, shown) if run.path.is_dir() else ():
                     stopped.add_note(line)
+        elif any(HALF_DOWN in note for note in getattr(stopped, "__notes__", [])):
+            stopped.add_note(next_step(command, shown, "--take-over"))
         elif hasattr(stopped, "__notes__") and (
             isinstance(stopped, DriverError | ExperimentError) or _is_unsettled(stopped)
         ):

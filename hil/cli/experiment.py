@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 TakeOver = Annotated[
     bool,
     typer.Option(
-        "--take-over", help="Take over an arm whose torque is already on. It sinks slowly: support it by hand."
+        "--take-over",
+        help="Take over an arm whose torque is already on. It sinks, braked by its motors, for at most 20 s until it "
+        "rests, then torque is cut: support it by hand.",
     ),
 ]
 StartFrom = Annotated[

@@ -16,6 +16,8 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
 
     command: the subcommand that was stopped. shown: the configuration's path as the user wrote it.
     """
+    if nothing := _nothing_recorded(run, shown):
+        return nothing
     if run.result_path.is_file():
         return ["The result is kept; the report is missing.", next_step("report", run.path)]
     if can_be_estimated(run.path):
@@ -32,9 +34,21 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
 
 def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
     """Sentences about what remains after the guard or a failed servo stopped a run; the last gives the next command."""
+    if nothing := _nothing_recorded(run, shown):
+        return nothing
     if can_be_estimated(run.path):
         return ["The recording has been kept and is complete enough for an estimate.", next_step("estimate", run.path)]
     return [f"The recording up to that point is kept in {run.path}.", next_step("check", shown)]
+
+
+def _nothing_recorded(run: RunFolder, shown: Path) -> list[str]:
+    """Say that a folder without a recording or result is still there; nothing if it holds either."""
+    if run.result_path.is_file() or run.samples_path.is_file() or _steps(run.path):
+        return []
+    return [
+        f"Nothing was recorded, but {run.path} could not be removed: check that its disk is writable.",
+        next_step("check", shown),
+    ]
 
 
 def can_be_estimated(path: Path) -> bool:

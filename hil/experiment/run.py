@@ -36,11 +36,12 @@ from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
 from hil.setup.bus_rate import seldom_read_back
 from hil.setup.changed_settings import EXPLAINED, WRITTEN, Settings, changed_settings, may_be_later, settings_now
-from hil.setup.lying import from_where_it_lies, moved_without_torque, said_of_the_rest, tolerance_now, wait_for_rest
+from hil.setup.lying import from_where_it_lies, moved_without_torque, said_of_the_rest, tolerance_now
+from hil.setup.pairs import mirrored_pairs
 from hil.setup.realtime import on_time
 from hil.setup.session.end_of_session import about_torque, confirmed_later
 from hil.setup.session.servo_session import REBOOT_S, has_moved, lay_at_start, servo_session, settings_at_start
-from hil.setup.unmoved import Lies, has_stirred, refuse_moved, where_it_lies
+from hil.setup.unmoved import Lies, has_stirred, refuse_moved, wait_for_rest, where_it_lies
 
 __all__ = ["run_experiment"]
 
@@ -106,8 +107,10 @@ def run_experiment(
             config, plan = _from_where_it_lies(config, plan, bus, run, note)
         if seldom := seldom_read_back(bus, bus.prepared, bus.port.off_wire):
             note(seldom)
+        run.refuse_lost()
         _write_facts(config, run, plan, bus, shown_path, seldom)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
+            run.refuse_lost()  # from now on, the recorder can save the files again
             # Signals are deferred from before torque comes on until the servos' settings are restored.
             with stop.only_noted(), servo_limits(config, bus, note):
                 changed = _play(config, plan, bus, recorder, stop, shown, note, arms, lies)
@@ -366,7 +369,8 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:
-    """Check that the arm is in its rest pose; if it is not, zero_ticks, direction or the arm's description is wrong.
+    """Check that the arm is in its rest pose and that the servos of one joint agree; otherwise zero_ticks, direction or
+    the arm's description is wrong.
 
     After a run that passed this check, friction may hold the arm up to twice the tolerance away from it.
     """
@@ -381,6 +385,8 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
                 f"{joint} is at {position:.3f} rad; arm.rest_pose is {rest:.3f} and arm.rest_tolerance allows "
                 f"{tolerance:g}. {rest_pose_hint(position, rest, tolerance, ticks)}{or_there}"
             )
+    if not has_moved() and (mirrored := list(mirrored_pairs(config, bus))):
+        raise WrongSetting(" ".join(mirrored))
 
 
 def _positions(config: Config, bus: ServoBus) -> list[float]:

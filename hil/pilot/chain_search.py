@@ -29,8 +29,9 @@ from hil.pilot.steps import Step, tells_of_the_arm
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
-from hil.setup.lying import from_where_it_lies, said_of_the_rest, wait_for_rest
+from hil.setup.lying import from_where_it_lies, said_of_the_rest
 from hil.setup.session.servo_session import Say, servo_session
+from hil.setup.unmoved import wait_for_rest
 
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7

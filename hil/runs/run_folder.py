@@ -119,6 +119,8 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._written: list[Path] = []
+        """Files without which the recording could not be used, written before it begins."""
 
     @classmethod
     def create(cls, path: Path, config: Config) -> "RunFolder":
@@ -135,9 +137,24 @@ class RunFolder:
                 (path / urdf.name).write_bytes(kept_bytes(urdf))
             if config.is_chain:
                 keep_shapes(described_arm(config), path)
+            run._written += path.iterdir()
         except OSError as error:
             raise RunFolderError(f"Run folder {path} cannot be written: {error.strerror}.") from error
         return run
+
+    def refuse_lost(self) -> None:
+        """Raise RunFolderError if the folder has been removed, renamed or emptied since it was created.
+
+        Servo settings and facts of the run are written to a new folder of that name, which lacks the configuration.
+        """
+        if gone := [each.name for each in self._written if not each.is_file()]:
+            lost = RunFolderError(
+                f"Run folder {self.path} was removed or renamed while the run was being prepared: {gone[0]} is no "
+                "longer there. Torque was not switched on for this run, and nothing of it has been recorded. Start "
+                "again, and leave the folder in place until the command ends."
+            )
+            lost.exit_code = 1  # the input was valid
+            raise lost
 
     def discard_if_unused(self) -> bool:
         """Remove the folder if the experiment failed before the first sample. Returns whether it was removed.
@@ -264,11 +281,14 @@ class RunFolder:
         """Save the [experiment] and [stabiliser] tables actually used, if they differ from the file (pilot, computed
         torque or gains), and the rest pose of a spatial arm.
         """
-        write_json(self.played_path, played.experiment.model_dump())
+        tables = {self.played_path: played.experiment.model_dump()}
         if played.stabiliser is not None:
-            write_json(self.stabiliser_path, played.stabiliser.model_dump())
+            tables[self.stabiliser_path] = played.stabiliser.model_dump()
         if played.is_chain:
-            write_json(self.rest_pose_path, {"rest_pose": list(played.arm.rest_pose)})
+            tables[self.rest_pose_path] = {"rest_pose": list(played.arm.rest_pose)}
+        for path, table in tables.items():
+            write_json(path, table)
+            self._written.append(path)
 
     def set_aside(self, name: str, played: Config) -> None:
         """Move the run's recording to the subfolder `name`, so that another run can use this folder. played: the

@@ -15,6 +15,7 @@ from hil.drivers.errors import BusShared, DriverError, TorqueNotOff
 from hil.drivers.torque.off import and_list
 from hil.rest_pose_hint import within_limits
 from hil.setup.session.servo_session import has_moved
+from hil.setup.unmoved import wait_for_rest
 
 AFTER_A_RUN = 2.0
 """Factor applied to arm.rest_tolerance after a run: friction may hold the arm farther from its rest pose than before.
@@ -28,37 +29,10 @@ SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
 
 _LONGEST_SAG_S = 3.0  # longest wait for an arm that moves after torque is cut
 
-_LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
-"""Longest wait for an arm to come to rest [s], interval between checks [s], and smallest change between two checks that
-counts as motion [rad].
-"""
-
 
 def tolerance_now(config: Config) -> float:
     """Largest deviation from arm.rest_pose that is allowed before this run [rad]."""
     return config.rest_tolerance * (AFTER_A_RUN if has_moved() else 1.0)
-
-
-def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
-    """Wait at most `longest` [s] for an arm that is still swinging or falling after an earlier run to come to rest.
-
-    Returns a sentence naming a joint that is still moving after that time; "" if all are at rest. Raises BusShared if
-    another program switches torque on in the meantime.
-    """
-    clock = bus.port.clock
-    former, end = bus.read_positions(), clock.now() + longest
-    while True:
-        bus.wait_switched_off(clock.now() + _REST_EVERY_S)
-        latest = bus.read_positions()
-        away = [abs(now - before) for now, before in zip(latest, former, strict=True)]
-        if max(away) < _REST_WITHIN_RAD:
-            return ""
-        if clock.now() >= end:
-            return (
-                f"{bus.joints[away.index(max(away))]} is still moving after {longest:.0f} s without torque: "
-                f"{max(away):.3f} rad in {_REST_EVERY_S:g} s. Bring the arm to rest, then start again."
-            )
-        former = latest
 
 
 def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float]) -> str:

@@ -18,6 +18,7 @@ from hil.plan.find_torque import how_to_find_torque
 from hil.plan.stabiliser import too_slow
 from hil.setup.bus_rate import check_rate, goals_taken, seldom_as_measured
 from hil.setup.finding import Finding, Level
+from hil.setup.pairs import mirrored_pairs
 from hil.setup.servo_checks import check_servo
 from hil.setup.session.others import others_on_the_bus
 
@@ -50,6 +51,7 @@ def check_arm(config: Config) -> Iterator[Finding]:
         if not all_well:
             yield Finding(Level.STOP, "bus", "rate", "not measured", "Fix the servo problems above first.")
             return
+        yield from _pairs(config, bus)
         goals = list(_goals(bus))
         yield from goals
         if all(finding.level is not Level.STOP for finding in goals):
@@ -159,6 +161,14 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
         if each.left:
             what = "settings from an earlier run"
             yield Finding(Level.WARNING, config.port.url, what, f"not restored on {each.name}", each.left)
+
+
+def _pairs(config: Config, bus: ServoBus) -> Iterator[Finding]:
+    try:
+        for mirrored in mirrored_pairs(config, bus):
+            yield Finding(Level.STOP, "arm", "direction", "the two servos of one joint contradict each other", mirrored)
+    except DriverError as error:
+        yield Finding(Level.STOP, "bus", "direction", "not checked", str(error))
 
 
 def _still_off(bus: ServoBus) -> Iterator[Finding]:

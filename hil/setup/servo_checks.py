@@ -13,9 +13,11 @@ from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself
 from hil.drivers.preparation.unsuitable import APPLY_HOMING, ignored_homing, unsuitable_drive_mode
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
+from hil.next_step import command
 from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.setup.finding import Finding, Level
-from hil.setup.session.killed_run import recover
+from hil.setup.servo_settings import POWER_CYCLE
+from hil.setup.session.killed_run import half_let_down, left_behind, recover
 from hil.setup.session.settings_file import DamagedSettings
 
 _WARM_BELOW_LIMIT_C = 15
@@ -114,12 +116,19 @@ def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, 
     return _graded(error == HardwareError(0), "hardware error", describe_error(error), fix)
 
 
-def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+def _torque(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
     torque = servo.read("Torque Enable")
     fix = "Another program is driving it: stop that program first, or power-cycle the servo."
-    if torque and servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
-        fix = "A program left it on when it ended, and the servo's watchdog has tripped. Power-cycle the servo."
+    kept = left_behind(config.url, joint) if torque else None
+    if kept is not None and half_let_down(kept, servo):
+        fix = f"An earlier hil run left it on. Hold the arm by hand, then type: {_taking_over(config)}"
+    elif torque and servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
+        fix = f"A program left it on when it ended, and the servo's watchdog has tripped. {POWER_CYCLE}"
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
+
+
+def _taking_over(config: Config) -> str:
+    return command("identify" if config.experiment.pilot else "record", config.path, "--take-over")
 
 
 def _drive_mode(config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:

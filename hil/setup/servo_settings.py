@@ -17,6 +17,12 @@ Confirm = Callable[[str], bool]
 
 RETURN_DELAY_UNIT_US = 2
 _ATTEMPTS = 3
+POWER_CYCLE = (
+    "Power-cycle the servo. Its Operating Mode and limits stay as that program set them: check them with DYNAMIXEL "
+    "Wizard 2.0."
+)
+"""What to do about torque that a terminated program left on and whose former settings are not on file."""
+
 _PING_ONLY = load_control_table("XM430-W350")
 # Model Number, ID and similar registers have the same addresses in every X-series table.
 
@@ -43,7 +49,7 @@ def open_servo(port: Port, servo_id: int) -> Servo:
     if servo.read("Torque Enable"):
         fix = "Stop the program that is driving it, then try again."
         if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
-            fix = "A program left it on when it ended, and the servo's watchdog has tripped. Power-cycle the servo."
+            fix = f"A program left it on when it ended, and the servo's watchdog has tripped. {POWER_CYCLE}"
         raise WrongSetting(f"{servo.title} has torque on, which locks its EEPROM. {fix}")
     return servo
 

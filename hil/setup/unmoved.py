@@ -1,4 +1,5 @@
-"""Check that, until torque is switched on, the arm stays in the pose in which it was first read.
+"""Wait until the arm is at rest, and check that it then stays in the pose in which it was first read until torque is
+switched on.
 
 If its reported angles change, they are no longer correct: a horn has slipped, another servo answers, or another program
 has changed Homing Offset.
@@ -11,13 +12,18 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.joint import Joint
 from hil.errors import ExperimentError
 
-__all__ = ["MOST_RAD", "Lies", "has_stirred", "refuse_moved", "where_it_lies"]
+__all__ = ["MOST_RAD", "Lies", "has_stirred", "refuse_moved", "wait_for_rest", "where_it_lies"]
 
 MOST_RAD = 0.05
 """Largest motion allowed before torque is switched on [rad]; the guard allows the same before the start."""
 
 STIRRED_RAD = 0.004
 """Smallest motion that encoder noise cannot explain [rad]; an arm that moves this far is not at rest."""
+
+_LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
+"""Longest wait for an arm to come to rest [s], interval between checks [s], and smallest change between two checks that
+counts as motion [rad].
+"""
 
 Lies = Mapping[Joint, int]
 """Present Position of each servo [ticks]."""
@@ -26,6 +32,28 @@ Lies = Mapping[Joint, int]
 def where_it_lies(bus: ServoBus) -> Lies:
     """Read each servo's Present Position. Raises the same errors as `Servo.read`."""
     return {drive: servo.read("Present Position") for drive, servo in bus.drives.items()}
+
+
+def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
+    """Wait at most `longest` [s] for an arm that is still swinging or falling after an earlier run to come to rest.
+
+    Returns a sentence naming a joint that is still moving after that time; "" if all are at rest. Raises BusShared if
+    another program switches torque on in the meantime.
+    """
+    clock = bus.port.clock
+    former, end = bus.read_positions(), clock.now() + longest
+    while True:
+        bus.wait_switched_off(clock.now() + _REST_EVERY_S)
+        latest = bus.read_positions()
+        away = [abs(now - before) for now, before in zip(latest, former, strict=True)]
+        if max(away) < _REST_WITHIN_RAD:
+            return ""
+        if clock.now() >= end:
+            return (
+                f"{bus.joints[away.index(max(away))]} is still moving after {longest:.0f} s without torque: "
+                f"{max(away):.3f} rad in {_REST_EVERY_S:g} s. Bring the arm to rest, then start again."
+            )
+        former = latest
 
 
 def has_stirred(before: Lies, now: Lies) -> bool:

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, TorqueNotOff
-from hil.drivers.torque.off import TorqueOff, signals_held_back
+from hil.drivers.torque.off import TorqueOff, and_list, signals_held_back
 from hil.errors import ExperimentError, HilError
 
 _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
@@ -88,10 +88,18 @@ def about_torque(bus: ServoBus) -> str:
     """Return a sentence about the servos' torque while no run is in progress."""
     if bus.torque_off_report is not None:
         return str(bus.torque_off_report)
-    try:
-        on = [joint.title for joint, servo in bus.drives.items() if servo.read("Torque Enable")]
-    except DriverError as error:
-        return f"This command has not switched torque on, but could not read whether it is off: {error}"
-    if on:
-        return f"TORQUE IS ON at {' and '.join(on)}: it was on before this command."
-    return _NEVER_ON
+    on: list[str] = []
+    unread: list[tuple[str, DriverError]] = []
+    for joint, servo in bus.drives.items():
+        try:
+            if servo.read("Torque Enable"):
+                on.append(joint.title)
+        except DriverError as error:
+            unread.append((joint.title, error))
+    told = [f"TORQUE IS ON at {' and '.join(on)}: it was on before this command."] if on else []
+    if unread:
+        told.append(
+            "This command has not switched torque on, but could not read whether it is off at "
+            f"{and_list(title for title, _ in unread)}: {unread[0][1]}"
+        )
+    return " ".join(told) or _NEVER_ON

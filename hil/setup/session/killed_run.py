@@ -99,9 +99,29 @@ def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
 def is_left_on(servo: Servo, kept: Kept) -> bool:
     """Return whether the killed program left this servo's torque on. Raises the errors of `Servo.read`.
 
-    If torque is on in a mode other than that program's, another program has switched it on since.
+    If torque is on in a mode other than that program's, another program has switched it on since. Torque that was
+    already on when the arm was taken over is not the killed program's.
     """
+    if kept.was_held:
+        return False
     return bool(servo.read("Torque Enable")) and kept.changed.get(_MODE) in (None, servo.read(_MODE))
+
+
+def half_let_down(kept: Kept, servo: Servo) -> str:
+    """Say that a program ended while it was letting this servo's joint down (--take-over); "" if it did not, if torque
+    is off by now, or if the settings are the original ones. Raises the errors of `Servo.read`.
+    """
+    if not (kept.was_held and servo.read("Torque Enable")):
+        return ""
+    differing = what_is_left(kept, servo, read_settings(servo)).differing
+    if not differing:
+        return ""
+    lowered = ", ".join(f"{name} is {now} and was {before}" for name, (now, before) in differing.items())
+    return (
+        f"its torque is on, {lowered}: an earlier hil run ({kept.since}) ended while it was letting the arm down. Hold "
+        "the arm by hand, then start again with --take-over, which lets it down completely and restores these values; "
+        "or hold it and switch its supply off and on, after which `hil check` restores them."
+    )
 
 
 def switch_off_left(servo: Servo, kept: Kept) -> bool:
@@ -112,6 +132,8 @@ def switch_off_left(servo: Servo, kept: Kept) -> bool:
     if is_left_on(servo, kept):
         servo.write("Torque Enable", 0)
         return True
+    if told := half_let_down(kept, servo):
+        raise TorqueHeld(f"{servo.title}: {told}")
     if servo.read("Torque Enable"):
         raise TorqueHeld(
             f"{servo.title}: its torque is on in Operating Mode {servo.read(_MODE)}, but an earlier run "
@@ -145,6 +167,9 @@ def recover(servo: Servo, port: str) -> Restored:
     """
     kept = settings_file.load(port, servo.id, servo.table.model)
     if kept is None or not kept.may_restore:
+        return Restored()
+    if kept.was_held and servo.read("Torque Enable") and not half_let_down(kept, servo):
+        settings_file.forget(kept)  # nothing of it is left, and the torque is another program's
         return Restored()
     was_on = switch_off_left(servo, kept)
     left = what_is_left(kept, servo, read_settings(servo))

@@ -16,7 +16,14 @@ from hil.errors import HilError
 from hil.next_step import command
 from hil.setup.scan import Found, Heard, Watch, scan
 from hil.setup.session import settings_file
-from hil.setup.session.killed_run import Restored, is_left_on, recover, switch_off_left, what_is_left
+from hil.setup.session.killed_run import (
+    Restored,
+    half_let_down,
+    is_left_on,
+    recover,
+    switch_off_left,
+    what_is_left,
+)
 from hil.setup.session.settings_file import DamagedSettings, Kept
 
 _USUAL_BAUD = 1_000_000
@@ -57,6 +64,9 @@ def about_leftovers(servo: Servo) -> Leftovers | None:
     run = f"An earlier hil run ({when}) ended before it could restore this servo"
     where = f"Its settings from before that run are in {kept.path}."
     try:
+        if told := half_let_down(kept, servo):
+            again = _taking_over(kept, port)
+            return Leftovers(f"{told[:1].upper()}{told[1:]} {where}", again, "half let down by an earlier run")
         differing = what_is_left(kept, servo, read_settings(servo)).differing
         was_left_on, is_on = is_left_on(servo, kept), bool(servo.read("Torque Enable"))
     except PortLost:
@@ -81,6 +91,12 @@ def _restoring(kept: Kept, port: Port) -> str:
         return command("check", kept.config)
     baud = ["--baud", port.baud] if port.has_baud and port.baud != _USUAL_BAUD else []
     return command("setup", port.url, *baud, "--id", kept.id)
+
+
+def _taking_over(kept: Kept, port: Port) -> str:
+    """The command that lets the arm down and restores a servo; "" if the run's configuration no longer describes it."""
+    is_described = kept.config and _describes(Path(kept.config), kept, port)
+    return command("record", kept.config, "--take-over") if is_described else ""
 
 
 def _describes(path: Path, kept: Kept, port: Port) -> bool:

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, WrongModel, WrongSetting
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import attainable, put_back, unlike
+from hil.drivers.preparation.settings import PROTECTIVE, attainable, put_back, read_settings, unlike
 from hil.drivers.servo import Servo
+from hil.drivers.torque.held import Originals
 from hil.errors import RunFolderError
 from hil.setup.session import settings_file
 from hil.setup.session.killed_run import Left, is_left_on, left_behind, what_is_left
@@ -78,18 +79,42 @@ class SavedSettings:
         else:
             self._keep(joint, left.wanted, changed)
 
+    def save_held(self, joints: Iterable[Joint]) -> Originals:
+        """Write the settings of servos that are about to be let down to disk, and return them.
+
+        If an earlier program began to let them down, its file holds the original goals. Raises the errors of
+        `Servo.read`.
+        """
+        for joint in joints:
+            servo = self.bus.drives[joint]
+            settings, since = read_settings(servo), ""
+            changed = {name: settings[name] for name in ("Operating Mode", *PROTECTIVE) if name in settings}
+            if joint in self.left:
+                left = what_is_left(self.left[joint], servo, settings)
+                settings, changed, since = left.wanted, {**left.kept.changed, **left.changed}, left.kept.since
+            self.left[joint] = self._on_file(joint, settings, changed, since, was_held=True)
+        return {joint: self.left[joint].settings for joint in joints}
+
     def _keep(self, joint: Joint, settings: dict[str, int], changed: dict[str, int], since: str = "") -> None:
-        url, model = self.bus.port.url, joint.servo.name
         self.wanted[joint] = settings
+        self.kept[joint] = self._on_file(joint, settings, changed, since)
+
+    def _on_file(
+        self, joint: Joint, settings: dict[str, int], changed: dict[str, int], since: str, *, was_held: bool = False
+    ) -> Kept:
+        """Write a servo's file; if that fails, report the values, those that this program changes first."""
+        url, model = self.bus.port.url, joint.servo.name
         try:
-            self.kept[joint] = settings_file.keep(url, joint.id, model, settings, changed, since, self.config)
+            return settings_file.keep(url, joint.id, model, settings, changed, since, self.config, was_held=was_held)
         except RunFolderError as error:
-            values = ", ".join(f"{name} {value}" for name, value in settings.items())
+            ours = ("Goal PWM", "Goal Current") if was_held else ("Operating Mode", "Current Limit")
+            values = ", ".join(f"{name} {settings[name]}" for name in ours if name in settings)
+            copy = "" if was_held else f" For all settings, see {settings_file.COPY_NAME} in the run folder."
             self._say(
                 f"The settings of {joint} cannot be saved where the next run would find them: {error} If this program "
-                f"is killed, restore them by hand ({values}); a run folder's {settings_file.COPY_NAME} holds them too."
+                f"is killed, set them again by hand: {values}.{copy}"
             )
-            self.kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")
+            return Kept(url, joint.id, model, settings, changed, 0, "", was_held=was_held)
 
     def put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
         """Restore the settings of these joints; return the error of each joint that failed."""

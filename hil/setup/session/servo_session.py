@@ -7,7 +7,7 @@ restored at the end (`killed_run`).
 """
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -20,15 +20,17 @@ from hil.drivers.errors import BusShared, DriverError, PortLost, ServoRefused, T
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import PROTECTIVE, read_settings
 from hil.drivers.servo_model import Mode
+from hil.drivers.torque.held import FADE_S, SINKING_S, LetDown, Originals, in_current_mode
 from hil.drivers.torque.off import and_list, signals_held_back
 from hil.drivers.torque.switch import WATCH_S
+from hil.errors import ExperimentError
 from hil.setup.changed_settings import Settings, settings_now
 from hil.setup.session import settings_file
 from hil.setup.session.end_of_session import end_with, telling_of_torque
 from hil.setup.session.others import others_on_the_bus
 from hil.setup.session.saved_settings import SavedSettings
 from hil.setup.session.unrestored import unrestored
-from hil.setup.unmoved import Lies, where_it_lies
+from hil.setup.unmoved import Lies, wait_for_rest, where_it_lies
 
 __all__ = [
     "Say",
@@ -92,8 +94,10 @@ class ServoSession:
         bus = self.bus
         self.saved.look_for_left()
         bus.check_identity()
-        bus.release_held(ours=self.saved.left_on())
+        down = bus.release_held(ours=self.saved.left_on(), before_lowering=self._before_lowering)
         self._is_ours = True
+        if down.joints:
+            self._wait_for_rest(down)
         self.lay = where_it_lies(bus)
         if others := others_on_the_bus(bus):
             self._say(f"Also on this bus (left alone): {'; '.join(each.described for each in others)}.")
@@ -117,6 +121,32 @@ class ServoSession:
         if folder is not None:
             copies = {str(joint.id): kept.settings for joint, kept in self.saved.kept.items()}
             settings_file.write_durably(folder / settings_file.COPY_NAME, {"port": bus.port.url, "servos": copies})
+
+    def _before_lowering(self, joints: Collection[Joint]) -> Originals:
+        """Save the settings of servos that are about to be let down, and announce what will happen."""
+        originals = self.saved.save_held(joints)
+        self._say(
+            f"Torque is on at {and_list(map(str, joints))}. The arm is let down: within {2 * FADE_S:.0f} s, its "
+            f"motors' output is reduced to zero; it then sinks, braked by its motors, for at most {SINKING_S:.0f} s, "
+            "and torque is cut when it has come to rest. Hold the arm by hand: whether a real motor brakes in this way "
+            "has not been tested."
+        )
+        if unbraked := in_current_mode({joint: self.bus.drives[joint] for joint in joints}):
+            self._say(
+                f"{and_list(joint.title for joint in unbraked)}: in current mode, the motor brakes only if its "
+                "firmware obeys Goal PWM in that mode; otherwise the joint falls freely."
+            )
+        return originals
+
+    def _wait_for_rest(self, down: LetDown) -> None:
+        """Wait until an arm that has been let down is at rest without torque. Raises ExperimentError if it is not."""
+        if down.moving:
+            self._say(
+                f"{and_list(joint.title for joint in down.moving)} had not come to rest after {SINKING_S:.0f} s, when "
+                "torque was cut. Hold the arm by hand."
+            )
+        if moving := wait_for_rest(self.bus):
+            raise ExperimentError(moving)
 
     def warn(self) -> None:
         """If the last run was stopped, announce that the arm is about to move again, and give people time to step back.

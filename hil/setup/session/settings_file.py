@@ -37,7 +37,8 @@ class Kept:
 
     changed: the EEPROM registers that the program sets, with their values. program: the program's process ID. adapter:
     persistent name of the USB adapter; "" if it has none. device: the device behind the port's name; "" if it has none.
-    config: absolute path of the program's configuration; "" if unknown, as in files of earlier versions.
+    config: absolute path of the program's configuration; "" if unknown, as in files of earlier versions. was_held:
+    whether another program's torque was on when the settings were saved, because the arm was being taken over.
     """
 
     port: str
@@ -50,6 +51,7 @@ class Kept:
     adapter: str = ""
     device: str = ""
     config: str = ""
+    was_held: bool = False
 
     @property
     def path(self) -> Path:
@@ -99,15 +101,19 @@ def keep(
     changed: dict[str, int],
     since: str = "",
     config: str = "",
+    *,
+    was_held: bool = False,
 ) -> Kept:
     """Write the file of a servo; it is on disk when this function returns. Raises RunFolderError.
 
     If a file of the same servo exists under another name of the port, it is removed afterwards.
 
-    since: when these settings were first saved; by default, now. config: absolute path of the configuration.
+    since: when these settings were first saved; by default, now. config: absolute path of the configuration. was_held:
+    see `Kept`.
     """
     since = since or datetime.now().astimezone().isoformat(timespec="seconds")
-    kept = Kept(port, servo_id, model, settings, changed, os.getpid(), since, adapter_name(port), _device(port), config)
+    adapter, device = adapter_name(port), _device(port)
+    kept = Kept(port, servo_id, model, settings, changed, os.getpid(), since, adapter, device, config, was_held)
     former = load(port, servo_id, model)
     write_durably(kept.path, {"schema": SCHEMA, **asdict(kept)})
     if former is not None and former.path != kept.path:
@@ -173,7 +179,8 @@ def _parsed(contents: bytes) -> Kept | None:
         isinstance(table, dict) and all(type(value) is int for value in table.values())
         for table in (kept.settings, kept.changed)
     )
-    return kept if numbers and type(kept.program) is int and type(kept.config) is str else None
+    others = type(kept.program) is int and type(kept.config) is str and type(kept.was_held) is bool
+    return kept if numbers and others else None
 
 
 def forget(kept: Kept) -> str:
@@ -183,6 +190,8 @@ def forget(kept: Kept) -> str:
     except NotADirectoryError:
         pass
     except OSError as error:
+        if not os.path.lexists(kept.path):  # on a read-only disk, even a missing file cannot be removed
+            return ""
         return (
             f"{kept.path} cannot be removed: {error.strerror}. Its settings have been restored. Remove it, or the next "
             "run will restore them again."

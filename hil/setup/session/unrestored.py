@@ -8,7 +8,7 @@ from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
 from hil.drivers.torque.off import and_list, by_reason
 from hil.setup.changed_settings import Settings
-from hil.setup.session.killed_run import recover
+from hil.setup.session.killed_run import half_let_down, recover
 from hil.setup.session.saved_settings import SavedSettings
 
 _DELAY = "Return Delay Time"
@@ -54,8 +54,12 @@ def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
     restored.
     """
     waiting: list[tuple[Joint, str]] = []
-    for joint in saved.left:
+    half_down: list[Joint] = []
+    for joint, kept in saved.left.items():
         if joint in saved.kept:
+            continue
+        if kept.was_held and not is_ours:
+            half_down += [joint] if _is_half_down(saved, joint) else []
             continue
         why = "This run ended before it could restore them."
         if is_ours:
@@ -67,12 +71,29 @@ def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
             except DriverError as error:
                 why = str(error)
         waiting.append((joint, why))
+    if half_down:
+        yield (
+            f"The settings of {and_list(map(str, half_down))} from before the arm was taken over are in "
+            f"{_where([saved.left[joint].path for joint in half_down])}. The next start with --take-over restores "
+            "them; if the servos are switched off and on, `hil check` does so, too."
+        )
     for why, joints in by_reason(waiting).items():
         paths = [saved.left[joint].path for joint in joints]
         yield (
             f"The settings that an earlier run left on {and_list(map(str, joints))} are not restored yet. {why} "
             f"{_NEXT} {_where(paths)}."
         )
+
+
+def _is_half_down(saved: SavedSettings, joint: Joint) -> bool:
+    """Whether a servo with torque on still has lowered goals; if it has not, its file is removed."""
+    kept = saved.left[joint]
+    try:
+        if half_let_down(kept, saved.bus.drives[joint]):
+            return True
+        return bool(recover(saved.bus.drives[joint], saved.bus.port.url).others)
+    except DriverError:
+        return True
 
 
 def _changed_delays(saved: SavedSettings, delays: Mapping[Joint, int], silent: Collection[Joint]) -> Iterator[str]:

@@ -6,6 +6,9 @@ from pathlib import Path
 import pytest
 
 from hil.config.schema import Config
+from hil.drivers.torque.switch import TorqueSwitch
+from hil.errors import RunFolderError
+from hil.experiment import run
 from hil.runs.run_folder import RunFolder
 from tests.support.command_line import hil
 from tests.support.edits import QUICK
@@ -22,16 +25,62 @@ def test_a_failed_start_can_be_tried_again(arm_file: Callable[..., Path], capsys
         assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("during", "is_made_again"), [("_check_rate", False), ("_check_rate", True), ("_write_facts", True)]
+)
+def test_a_folder_that_is_lost_before_the_run_is_noticed_before_torque_is_on(
+    arm_file: Callable[..., Path],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    during: str,
+    is_made_again: bool,
+) -> None:
+    path = arm_file(*QUICK)
+    out = path.parent / "run"
+    asked = getattr(run, during)
+
+    def losing(*args: object) -> object:
+        done = asked(*args)
+        if out.exists():
+            out.rename(path.parent / "elsewhere")
+        if is_made_again:
+            out.mkdir(exist_ok=True)
+        return done
+
+    monkeypatch.setattr(run, during, losing)
+    monkeypatch.setattr(TorqueSwitch, "_torque_on", lambda *_: pytest.fail("torque was switched on"))
+    assert hil("record", path, "--out", out) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"{out} was removed or renamed" in said and "Torque is off" in said
+    assert not out.exists()
+
+
+def test_a_folder_without_a_recording_that_cannot_be_removed_is_not_said_to_hold_one(
+    arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = arm_file(*QUICK)
+    out = path.parent / "run"
+
+    def full(*_: object) -> None:
+        raise RunFolderError(f"{out}/run.json cannot be written: Read-only file system.")
+
+    monkeypatch.setattr(run, "_write_facts", full)
+    monkeypatch.setattr("shutil.rmtree", lambda *_, **__: None)
+    assert hil("record", path, "--out", out) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "Nothing was recorded" in said and "kept" not in said and f"Next: hil check {path}" in said
+
+
 def test_what_was_recorded_stays(identified: Path) -> None:
     assert not RunFolder(identified).discard_if_unused()
     assert (identified / "samples.npy").is_file()
 
 
 def test_somebody_elses_file_stays(arm: Callable[..., Config], tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run", arm())
-    (run.path / "thesis.pdf").write_bytes(b"x")
-    assert not run.discard_if_unused()
-    assert (run.path / "thesis.pdf").is_file()
+    folder = RunFolder.create(tmp_path / "run", arm())
+    (folder.path / "thesis.pdf").write_bytes(b"x")
+    assert not folder.discard_if_unused()
+    assert (folder.path / "thesis.pdf").is_file()
 
 
 def test_ctrl_c_during_the_estimate_keeps_the_recording_and_says_how_to_go_on(

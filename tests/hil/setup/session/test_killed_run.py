@@ -111,10 +111,10 @@ def test_settings_that_cannot_be_saved_are_said_in_one_sentence(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
     config, said = arm(SHORT), list[str]()
     bus: Any = SimpleNamespace(port=SimpleNamespace(url=config.url))
-    settings = {"Operating Mode": 3, "Current Limit": 910}
+    settings = {"Current Limit": 910, "Operating Mode": 3, "Shutdown": 52}
     SavedSettings(bus, said.append).save(config.bus.joints[0], settings, {})
     assert "cannot be saved where" in said[0] and ".json cannot be written: Not a directory. If this program" in said[0]
-    assert "Operating Mode 3, Current Limit 910" in said[0] and "servo_settings.json" in said[0]
+    assert "Operating Mode 3, Current Limit 910." in said[0] and "servo_settings.json" in said[0]
 
 
 def test_nothing_is_left_of_a_file_that_could_not_be_written(
@@ -163,6 +163,17 @@ def test_a_file_that_cannot_be_removed_is_named(arm: Arm, monkeypatch: pytest.Mo
     with servo_session(config, say=said.append):
         monkeypatch.setattr(Path, "unlink", read_only)
     assert len([each for each in said if "cannot be removed: Read-only" in each and "Remove it" in each]) == 2
+
+
+def test_a_file_that_was_never_written_need_not_be_removed(state_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a read-only disk, removing a file that does not exist fails too."""
+
+    def read_only(_path: Path, missing_ok: bool = False) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(Path, "unlink", read_only)
+    kept = settings_file.Kept("fake://arm.toml", 1, "XM430-W350", {}, {}, 0, "")
+    assert settings_file.forget(kept) == ""
 
 
 class _Gone(BaseException):
