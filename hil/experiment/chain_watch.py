@@ -51,7 +51,7 @@ _DOUBTS = (
     "The arm may not be the one described: the direction, zero_ticks or axis of this joint or of another one, or "
     "arm.base, may be wrong. Move the joints by hand, with torque off, to find out."
 )
-_AGAINST_STOP = "A motor whose direction is wrong may press the joint against the end stop on which it rests."
+_AGAINST_STOP = " A motor whose direction is wrong may press the joint against the end stop on which it rests."
 
 
 class ChainWatch:
@@ -156,7 +156,8 @@ class ChainWatch:
                 f"{WINDOW_S:g} s: any arm consistent with the prior and the data so far would be moving."
             )
             blocked_by = self._blocked_by[joint]
-            causes = f"{_DOUBTS} {_AGAINST_STOP} Otherwise, {blocked_by[0].lower()}{blocked_by[1:]}"
+            against_stop = "" if self._was_below[joint] or self._was_above[joint] else _AGAINST_STOP
+            causes = f"{_DOUBTS}{against_stop} Otherwise, {blocked_by[0].lower()}{blocked_by[1:]}"
         else:
             self._explain(joint, float(lacking), [state for state, _ in self._commanded])
             said = (
