@@ -416,7 +416,7 @@ def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) ->
 
     fall = replace(first.stops.fall, hits=None, seconds=1.5)
     lines = chain_dry_run_lines(replace(first, stops=replace(first.stops, fall=fall)))
-    assert any(": it hits nothing within 1.50 s, " in line for line in lines)
+    assert any(": it hits nothing within 1.50 s; " in line for line in lines)
 
     # Where no share is safe, both refuse, for the same reason.
     monkeypatch.setattr(SafeShares, "_largest", lambda *_: (None, "shank and floor: 2 mm", 0.0))
