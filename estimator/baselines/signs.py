@@ -231,11 +231,15 @@ def _combinations(joints: int) -> Iterator[Signs]:
     yield from sorted((signs for signs in every if signs.reversed_columns), key=lambda each: len(each.reversed_columns))
 
 
-def _fit(recordings: Sequence[Recording], signs: Signs) -> InverseDynamics | None:
+def with_signs(recordings: Sequence[Recording], signs: Signs) -> list[Recording]:
+    """Return the recordings with the columns of `signs` reversed."""
     torque, position = (np.array(each, dtype=float)[:, None] for each in (signs.torque, signs.position))
-    turned = [replace(each, torque=each.torque * torque, position=each.position * position) for each in recordings]
+    return [replace(each, torque=each.torque * torque, position=each.position * position) for each in recordings]
+
+
+def _fit(recordings: Sequence[Recording], signs: Signs) -> InverseDynamics | None:
     try:
-        return fit_inverse_dynamics(turned, CUTOFF, COULOMB_WIDTH)
+        return fit_inverse_dynamics(with_signs(recordings, signs), CUTOFF, COULOMB_WIDTH)
     except EstimationError:
         return None
 

@@ -60,7 +60,8 @@ def _estimate_planar(
     zeros = (columns.zeros_unknown or config.model.zeros) and gravity > 0.0
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
     refuse_stuck(read.recordings, ", ".join(map(str, paths)), columns.segment)
-    refuse_slips(read.recordings, ", ".join(map(str, paths)), columns.zero)
+    zero_is_set = config.columns.zero is not None
+    refuse_slips(read.recordings, ", ".join(map(str, paths)), columns.zero, zero_is_set)
     jumps = jump_sentences(whole.recordings, whole.names, whole.stepped)
     repeats = all(one is not mean for one, mean in zip(whole.recordings, read.recordings, strict=True))
     lengths, joints = config.arm.link_lengths, read.recordings[0].joints

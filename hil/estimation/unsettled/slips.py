@@ -13,7 +13,9 @@ from hil.estimator.baselines.signs import (
     suspect_order,
     suspect_signs,
     suspect_swapped,
+    with_signs,
 )
+from hil.estimator.baselines.zero import turned_zeros
 from hil.estimator.data.recording import Recording
 
 CLEAR = 0.25
@@ -27,11 +29,14 @@ WELL = 0.3
 """A mistake is clear only if correcting it leaves a torque residual of less than this fraction of the RMS torque."""
 
 
-def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None = None) -> None:
+def refuse_slips(
+    recordings: Sequence[Recording], source: str, zero: Sequence[float] | None = None, zero_is_set: bool = True
+) -> None:
     """Raise CsvError if a sign is reversed, joints or torques are swapped, or an angle is measured from a fixed
     direction instead of from the previous link.
 
-    zero: columns.zero, which the angles in the recordings already include; None if it is not known.
+    zero: columns.zero, which the angles in the recordings already include; None if it is not known. zero_is_set:
+    whether the user set it.
     """
     _refuse_absolute(recordings, source, zero)
     order = suspect_order(recordings)
@@ -56,7 +61,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
     if _is_clear(signs.residual, signs.residual_given):
         raise CsvError(
             f"{source}: {reversal_said(signs.signs)}, {unexplained(signs.residual, signs.residual_given)}. "
-            f"{_correction(signs.signs, zero)}"
+            f"{_correction(recordings, signs.signs, zero if zero_is_set else None)}"
         )
     # Reversing all torques leaves the same residual, but no body has a negative inertia.
     inertias = [name for name in signs.impossible if name.startswith("inertia")]
@@ -64,16 +69,17 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
         verb = "are" if signs.signs.are_several else "is"
         raise CsvError(
             f"{source}: {signs.signs.said()} {verb} reversed: as given, {' and '.join(inertias)} would be negative. "
-            f"{_correction(signs.signs, zero)}"
+            f"{_correction(recordings, signs.signs, zero if zero_is_set else None)}"
         )
 
 
-def _correction(signs: Signs, zero: Sequence[float] | None) -> str:
-    """Say how to reverse columns; the zero of a reversed angle changes its sign too."""
-    turned = [-value if sign < 0 else value for value, sign in zip(zero or (), signs.position, strict=False)]
-    if turned == list(zero or ()):
+def _correction(recordings: Sequence[Recording], signs: Signs, zero: Sequence[float] | None) -> str:
+    """Say how to reverse columns. zero: columns.zero if the user set it; that of a reversed angle must change too."""
+    if zero is None or min(signs.position) > 0:
         return "Correct this in the file."
-    said = ", ".join(f"{value:.6g}" for value in turned)
+    moved = turned_zeros(with_signs(recordings, signs))
+    turned = np.array(zero) * signs.position + (0.0 if moved is None else moved)
+    said = ", ".join(f"{(each + math.pi) % (2.0 * math.pi) - math.pi:.4f}" for each in turned.tolist())
     return f"Correct this in the file, and set in [columns] of --config ARM.toml: zero = [{said}]."
 
 

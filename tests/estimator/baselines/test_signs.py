@@ -138,7 +138,13 @@ def test_an_origin_that_is_half_a_turn_off_is_found_from_the_sign_of_gravity(tur
 
 
 def test_the_zero_of_a_reversed_angle_changes_its_sign(recording: Recording) -> None:
-    with pytest.raises(CsvError, match=r"the position of joint 1 is reversed.* zero = \[-0\.3, 0\.2\]\.$"):
+    with pytest.raises(CsvError, match=r"the position of joint 1 is reversed.* zero = \[-0\.3000, 0\.2000\]\.$"):
         refuse_slips([turned(recording, (1, 1), (-1, 1))], "arm.csv", (0.3, 0.2))
     with pytest.raises(CsvError, match=r"the signs of both torques are reversed.* Correct this in the file\.$"):
         refuse_slips([turned(recording, (-1, -1), (1, 1))], "arm.csv", (0.3, 0.2))
+    half = turned(recording, (1, 1), (-1, 1))
+    half = replace(half, position=half.position + np.array([[np.pi], [0.0]]))
+    with pytest.raises(CsvError, match=r"zero = \[2\.8416, 0\.2000\]\.$"):
+        refuse_slips([half], "arm.csv", (0.3, 0.2))
+    with pytest.raises(CsvError, match=r"the position of joint 1 is reversed.* Correct this in the file\.$"):
+        refuse_slips([turned(recording, (1, 1), (-1, 1))], "arm.csv", (0.3, 0.2), zero_is_set=False)
