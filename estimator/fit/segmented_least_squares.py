@@ -138,10 +138,6 @@ class _Damping:
     """Damping of the next step."""
 
     factor: float
-    size: Array
-    """Largest squared sensitivity to each shared coordinate so far (shared,); it scales the damping (More, 1978), so
-    that a coordinate that loses its effect does not run away.
-    """
     options: SegmentedMinimiserOptions
 
     @property
@@ -203,7 +199,7 @@ class _Equations:
     def solved(self, rows: Sequence[Array], pull: Array, damping: _Damping) -> _Step:
         """Return the damped Gauss-Newton step that reduces `rows`. pull: gradient of the prior (shared,)."""
         information, scores, solve, known = self.eliminated(rows, damping.factor)
-        scale = np.sqrt(np.maximum(damping.size, 1e-12 * damping.size.max()))
+        scale = np.sqrt(np.maximum(self.size, 1e-12 * self.size.max()))
         matrix = information / np.outer(scale, scale) + damping.factor * np.eye(pull.size)
         step = -linalg.lstsq(matrix, (scores.sum(axis=0) + pull) / scale, rcond=1e-13)[0] / scale
         step = np.clip(step, -damping.max_step, damping.max_step)
@@ -257,10 +253,9 @@ def minimise_segmented(
             there = move(shared, step[0]), own + step[1]
             return (*there, _residuals(residual, *there, threads))
 
-        damping, is_curved, was_small = _Damping(options.initial_damping, np.zeros(shared.size), options), False, False
+        damping, is_curved, was_small = _Damping(options.initial_damping, options), False, False
         for iteration in range(1, options.max_iterations + 1):
             equations = _equations(derivative, prior, shared, own, threads)
-            damping = replace(damping, size=np.maximum(damping.size, equations.size))
             gained, is_first = 0.0, True
             while damping.factor < options.max_damping:
                 step = _step(equations, damping, partial(after, shared, own), is_curved)
