@@ -20,7 +20,7 @@ from hil.drivers.torque.off import has_torque, signals_held_back
 FADE_S = 1.0
 """Time over which a held servo's output limit is reduced to zero [s]."""
 
-SINKING_S = 20.0
+SINKING_S = 60.0
 """Longest time for which joints may sink, braked by their motors, before torque is cut [s]."""
 
 HALF_DOWN = "The arm was being let down; its torque was left on"
@@ -30,7 +30,7 @@ _STEPS = 20
 _LOOK_S = 0.05
 """Interval at which positions and goals are read while the arm sinks [s]."""
 
-_STILL_S, _STILL_TICKS = 0.5, 6
+_STILL_S, _STILL_TICKS = 1.0, 3
 """A joint whose Present Position changes by at most `_STILL_TICKS` within `_STILL_S` [s] counts as still."""
 
 

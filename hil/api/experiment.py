@@ -51,7 +51,7 @@ def identify(
         config: TOML file of the arm, the name of a bundled one such as "fake_two_link", or a loaded configuration.
         out: run folder, which must be new or empty; by default runs/TIME-ARM.
         take_over: take over an arm that another program left with its torque on, and let it sink, braked by its
-            motors, for at most 20 s; support it by hand.
+            motors, for at most 60 s; support it by hand.
         start_from: run folder or result.json of an earlier identification of the same arm. It replaces the prior,
             so that fewer runs are needed; requires experiment.pilot. If the arm does not move as that result predicts,
             the prior is used.

@@ -21,7 +21,7 @@ TakeOver = Annotated[
     bool,
     typer.Option(
         "--take-over",
-        help="Take over an arm whose torque is already on. It sinks, braked by its motors, for at most 20 s until it "
+        help="Take over an arm whose torque is already on. It sinks, braked by its motors, for at most 60 s until it "
         "rests, then torque is cut: support it by hand.",
     ),
 ]

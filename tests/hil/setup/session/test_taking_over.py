@@ -244,6 +244,31 @@ def test_an_arm_that_still_sinks_when_its_torque_is_cut_is_first_read_at_rest(
     assert "Joint 'shoulder' (ID 1, XM430-W350)" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("off_upright", [0.1, 0.15, 0.2, 0.25, 0.3])
+def test_a_joint_that_creeps_under_its_brake_is_not_at_rest(arm: Arm, bench: Bench, off_upright: float) -> None:
+    """Near its upright pose, gravity hardly exceeds friction, and only the brake keeps the arm from falling."""
+    at_cut: list[float] = []
+
+    def prepared(port: Any) -> None:
+        plant, servo = port.bus.plant, port.bus.servos[1]
+        plant._state = (1.57 - off_upright, *(0.0,) * 7)
+        hold(port)
+        write = servo.write
+
+        def noting(address: int, data: bytes) -> Any:
+            if address == 64 and data == b"\x00" and not at_cut:
+                at_cut.append(max(map(abs, plant.velocity)))
+            return write(address, data)
+
+        servo.write = noting
+
+    bench.prepare = prepared
+    limited = [(each, f"{each}voltage_limited = true\n") for each in (SERVO_1, SERVO_2)]
+    with servo_session(taking_over(arm(SHORT, *limited))):
+        pass
+    assert at_cut[0] < 0.008, "3 ticks a second, and their rounding"
+
+
 def test_a_servo_that_does_not_answer_does_not_hide_the_torque_of_the_others(
     arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
