@@ -31,7 +31,8 @@ def chain_too_slow(config: Config) -> str:
         f"experiment.rate = {rate:g} is too low for the stabiliser: each torque follows from a state read "
         f"{1e3 / rate:.0f} ms before and is held for as long. With a stiffness of {config.stabiliser.stiffness[at]:g} "
         f"N m/rad and a damping of {config.stabiliser.damping[at]:g} N m s/rad, joint {config.joints[at].name!r} "
-        f"may oscillate more and more: the arm may be lighter than described, with less friction. {raised or 'Lower'} stabiliser.stiffness and stabiliser.damping."
+        f"may oscillate more and more: the arm may be lighter than described, with less friction. {raised or 'Lower'} "
+        "stabiliser.stiffness and stabiliser.damping."
     )
 
 
