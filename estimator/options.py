@@ -187,7 +187,7 @@ class LikelihoodOptions:
 class ShootingOptions:
     """Options for multiple shooting, which fits any recording."""
 
-    ftol: float = 3e-6
+    ftol: float = 3e-5
     ftol_refine: float = 1e-3
     """Tolerance of the fits after each downweighting of segments."""
     ftol_start: float = 1e-2

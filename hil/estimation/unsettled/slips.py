@@ -44,7 +44,8 @@ def refuse_slips(
         raise CsvError(
             f"{source}: the joints seem to be in the wrong order: with angles and torques of joints 1 and 2 exchanged, "
             f"{unexplained(*order)}. "
-            "Joint 1 is the one at the base: name its columns first in [columns] of --config ARM.toml."
+            "Joint 1 is the one at the base: name its columns first in [columns] of --config ARM.toml"
+            f"{', and exchange the two values of zero as well' if zero_is_set and zero is not None else ''}."
         )
     for column, swapped in (
         ("torque", suspect_swapped(recordings)),

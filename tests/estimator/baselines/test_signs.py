@@ -148,3 +148,13 @@ def test_the_zero_of_a_reversed_angle_changes_its_sign(recording: Recording) -> 
         refuse_slips([half], "arm.csv", (0.3, 0.2))
     with pytest.raises(CsvError, match=r"the position of joint 1 is reversed.* Correct this in the file\.$"):
         refuse_slips([turned(recording, (1, 1), (-1, 1))], "arm.csv", (0.3, 0.2), zero_is_set=False)
+
+
+def test_joints_in_the_wrong_order_have_their_zeros_in_the_wrong_order() -> None:
+    motion = two_joints(8.0)
+    order = slice(None, None, -1)
+    exchanged = Recording(motion.time, motion.torque[order], motion.position[order], np.full(2, 1.5e-3), "held")
+    with pytest.raises(CsvError, match=r"ARM\.toml, and exchange the two values of zero as well\.$"):
+        refuse_slips([exchanged], "arm.csv", (0.0, 0.0))
+    with pytest.raises(CsvError, match=r"of --config ARM\.toml\.$"):
+        refuse_slips([exchanged], "arm.csv")
