@@ -53,7 +53,7 @@ class SdkPort:
             port.overheard = b""
 
     def hear(self, received: bytes) -> None:
-        """Count late replies and another master's instructions among bytes outside the expected reply."""
+        """Count the late replies and another master's instructions in bytes outside the expected reply."""
         if received and not self._port.echoes:
             for packet in Framer().feed(received):
                 self._port.late_replies += packet.is_status

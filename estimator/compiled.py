@@ -16,7 +16,7 @@ PACKAGE = __name__.split(".", maxsplit=1)[0]
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Any:
-    """Compile `function` to run without the GIL, cached on disk until any code or constant that it contains changes."""
+    """Compile `function` to run without the GIL, and cache the result on disk until its code or constants change."""
     dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     # These attributes of numba are not public. Without this, the cache would only check the date of one file, as
     # numba's own cache does.

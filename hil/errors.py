@@ -123,7 +123,7 @@ class RunFolderError(HilError):
 
 
 class SchedulerLost(HilError):
-    """The scheduler of a study no longer responds. Example: its machine was switched off. Use --resume to continue."""
+    """The scheduler of a study no longer responds, perhaps because its machine was switched off. Use --resume."""
 
 
 class CsvError(HilError):

@@ -232,8 +232,8 @@ def _start(
     drives: list[dict[str, Any]],
     weight: float,
 ) -> list[float]:
-    """Draw the initial pose [rad]: off the rest pose by up to 4 degrees, but at most half as far as friction can hold
-    the joint.
+    """Draw the initial pose [rad]: within 4 degrees of the rest pose, and within half the deflection at which friction
+    can still hold the joint.
     """
     start = []
     for i, drive in enumerate(drives):

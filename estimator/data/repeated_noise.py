@@ -36,8 +36,8 @@ _ORDERS = np.arange(1, 30)
 _HEIGHTS = 1.0 / (2.0 * np.pi**2 * _ORDERS**2)
 _HEIGHTS *= ROUNDING / _HEIGHTS.sum()  # the series is truncated
 _REPEATS = _HEIGHTS * np.exp(-((2.0 * np.pi * _ORDERS * _STD[:, None]) ** 2))
-"""Repeating power of each order of the rounding error, for each value of `_STD`, without drift (stds, orders)
-[steps^2].
+"""Power of the repeating part of each order of the rounding error in the absence of drift, for each value of `_STD`
+(stds, orders) [steps^2].
 """
 _SLOW = 1.0 / 16.0  # fraction of the lines that drift may occupy
 _CHANGE = 0.03  # largest relative change in the motion from pass to pass

@@ -109,7 +109,7 @@ class Evidence:
     cause: str = ""
     """A likely cause of any residual, known from how the motion was driven, as a sentence."""
     ended_early: bool = False
-    """Whether there is no held-out motion because the recording ends before that motion settled."""
+    """Whether the held-out motion is missing because the recording ends before it settles."""
 
 
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:

@@ -56,8 +56,8 @@ class Response:
     state: Array
     """State after the last sample (6, joints), from which `respond` can continue.
 
-    The rows are angles [rad], velocities [rad/s], motor torques [N m], angles [rad] and velocities [rad/s] at the last
-    sample, and the torque of the bristles [N m].
+    The rows are: angles [rad] and velocities [rad/s] after the last sample; motor torques [N m]; angles [rad] and
+    velocities [rad/s] at the last sample; torques of the bristles [N m].
     """
 
 

@@ -32,7 +32,7 @@ def chain_left_out(model: ChainArmModel, carried: tuple[str, ...] = ()) -> list[
 
 
 def base_orientation(model: ChainArmModel) -> list[str]:
-    """A sentence if the arm's base is not upright, so that gravity does not act along the base's -z axis."""
+    """A note if the arm's base is not upright: gravity then does not act along the base's -z axis."""
     gravity = model.base_gravity
     if np.hypot(*gravity[:2]) <= LEVEL * np.linalg.norm(gravity) and gravity[2] <= 0.0:
         return []

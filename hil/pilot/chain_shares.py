@@ -213,7 +213,7 @@ class SafeShares:
         """Return the first safe fraction of the amplitude, why a larger one is unsafe, and the clearance that the
         larger one lacks [m].
 
-        If neither the first fraction nor the last one, tried on few arms, is safe, those in between are not tried.
+        If neither the first nor the last fraction is safe when tried on a few arms, those in between are not tried.
         """
         self._path += 1
         found, why, shortage = self._found(config, shares[0], f"amplitude 1 of at most {len(shares)}")

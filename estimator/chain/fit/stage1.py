@@ -69,7 +69,7 @@ def columns_of(model: ChainModel, motion: PeriodicMotion) -> Array:
 
 
 def columns_of_friction(motion: PeriodicMotion) -> Array:
-    """Return the regressor of viscous and Coulomb friction and of offsets (joints, samples, 3 joints), term by term."""
+    """Return the regressor of viscous friction, Coulomb friction and offsets (joints, samples, 3 * joints), by term."""
     joints, samples = motion.velocity.shape
     Y = np.zeros((joints, samples, 3 * joints))
     for joint, velocity in enumerate(motion.velocity):

@@ -145,7 +145,7 @@ def _early(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[
 
 
 def _weak(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool) -> list[str]:
-    """Name base parameters with a large relative error, except for gravity that is known to be negligible."""
+    """Name the base parameters with a large relative error, except gravity torques known to be negligible."""
     count = len(estimate.model.base_names)
     known = zip(estimate.names[:count], estimate.value, estimate.std, strict=False)
     torque = float(np.sqrt(np.mean([np.mean(each.torque**2) for each in recordings])))

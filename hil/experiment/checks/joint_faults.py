@@ -30,7 +30,7 @@ _FEWEST = 4
 """Minimum number of readings needed to explain how a current differs from its goal."""
 
 Fault = tuple[Cause, str]
-"""The cause of a fault, and a sentence about it that lacks its subject, the joint."""
+"""The cause of a fault, and its description as a predicate, to be preceded by the joint's name."""
 
 
 class JointFaults:
