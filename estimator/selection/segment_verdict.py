@@ -26,6 +26,12 @@ from hil.estimator.selection.verdict import (
 )
 
 NEARLY_EXPLAINED = 1.5  # ratio of residual to noise up to which undetermined friction near standstill does no harm
+INERTIAS = ("inertia", "armature")
+ZERO_INERTIA = 1e-3  # fraction of the arm's largest inertia below which one has ended at 0
+AT_BOUND = (
+    ", which ended at 0, the lower end of its range. The standard errors of the other inertias assume this value and "
+    "may be far too small"
+)
 EXPLAINED_PREDICTION = 0.15  # prediction error above which even a nearly explained motion is not trusted
 LITTLE_TORQUE = 0.1  # fraction of the RMS torque; gravity torques below this are negligible
 IMPROVEMENT = {
@@ -120,7 +126,7 @@ def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, 
         *evidence.doubts,
         *evidence.undetermined,
         *evidence.notes,
-        _weakest(weakest, relative[weakest], evidence.spoiled),
+        _weakest(weakest, relative[weakest], evidence.spoiled, _is_at_bound(estimate, weakest)),
         *((f'The verdict is not "yes" because {" and because ".join(rules)}.',) if rules and trust != "no" else ()),
     )
     return Verdict(trust, weakest, sentences)
@@ -202,10 +208,17 @@ def _predicted(held_out: Array | None, length: float) -> str:
     )
 
 
-def _weakest(name: str, part: float, spoiled: bool) -> str:
+def _is_at_bound(estimate: ShootingEstimate, name: str) -> bool:
+    """Return whether `name` is an inertia that ended at 0, which leaves its fit no slope to return along."""
+    values = dict(zip(estimate.names, estimate.value.tolist(), strict=False))
+    inertias = [value for each, value in values.items() if kind_of(each) in INERTIAS]
+    return kind_of(name) in INERTIAS and values[name] < ZERO_INERTIA * max(inertias)
+
+
+def _weakest(name: str, part: float, spoiled: bool, is_at_bound: bool) -> str:
     if not part < UNDETERMINED:
         remedy = "" if spoiled else f" To identify it, use {IMPROVEMENT[kind_of(name)]}."
-        return f"This motion does not determine {name}.{remedy}"
+        return f"This motion does not determine {name}{AT_BOUND if is_at_bound else ''}.{remedy}"
     if part <= WELL_KNOWN or spoiled:
         return f"The least certain parameter is {name}, known to within {percent(part)}."
     improvement = IMPROVEMENT[kind_of(name)]

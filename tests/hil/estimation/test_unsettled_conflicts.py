@@ -112,3 +112,15 @@ def test_an_undetermined_term_is_listed_without_an_infinite_error() -> None:
     estimate: Any = SimpleNamespace(names=("coulomb_width_1",), value=np.array([37.0]), std=np.array([np.inf]))
     (said,) = undetermined(estimate)
     assert "coulomb_width_1 (not at all)" in said
+
+
+@pytest.mark.parametrize(("value", "is_said"), [(1e-9, True), (0.01, False)])
+def test_an_inertia_that_ended_at_0_makes_the_errors_of_the_others_doubtful(value: float, is_said: bool) -> None:
+    estimate = estimated()
+    names = (*NAMES[:-1], "armature_2", NAMES[-1])
+    estimate.model.base_names, estimate.names = names, (*names, "torque_scale_2")
+    estimate.value = np.insert(estimate.value, 4, value)
+    estimate.std = np.insert(estimate.std, 4, np.inf)
+    said = " ".join(judge_segments([RECORDING], estimate, SegmentEvidence(np.array([0.004]))).sentences)
+    assert "This motion does not determine armature_2" in said
+    assert ("assume this value and may be far too small" in said) == is_said
