@@ -1,12 +1,11 @@
 """The conftest.py of docs/fake_bus_in_ci.md, for programs that cannot share an environment with hil."""
 
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 from tests.support.paths import ROOT
+from tests.support.processes.pytest_session import run_pytest
 
 THEIR_TESTS = """
 import subprocess
@@ -56,12 +55,5 @@ def test_the_conftest_for_programs_without_hil_in_their_environment(tmp_path: Pa
     hil = tmp_path / "hil"
     hil.write_text(f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m hil "$@"\n', encoding="utf-8")
     hil.chmod(0o755)
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:hil", "."],
-        cwd=tmp_path,
-        env={**os.environ, "HIL": str(hil)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_pytest(tmp_path, "no:hil", HIL=str(hil))
     assert "3 passed" in done.stdout, done.stdout + done.stderr

@@ -1,11 +1,9 @@
 """The plugin as other projects' tests use it: in another pytest process, with only the installed package."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 from tests.support.paths import ROOT
+from tests.support.processes.pytest_session import run_pytest
 
 THEIR_TESTS = f"""
 from hil.drivers.packet import encode, encode_status
@@ -44,15 +42,7 @@ def test_terminal(fake_pty):
 
 def test_fixtures_for_other_peoples_tests(tmp_path: Path) -> None:
     (tmp_path / "test_theirs.py").write_text(THEIR_TESTS, encoding="utf-8")
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "."]
-    done = subprocess.run(
-        command,
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_pytest(tmp_path, PYTHONPATH=str(ROOT))
     assert "4 passed" in done.stdout, done.stdout + done.stderr
 
 
@@ -71,7 +61,5 @@ def test_nothing_of_ours(request):
 def test_an_unrelated_session_imports_nothing_but_the_plugin(tmp_path: Path) -> None:
     (tmp_path / "test_unrelated.py").write_text(UNRELATED, encoding="utf-8")
     # Plugins of others, as far as they are known to import numpy, are none of ours.
-    others = ("no:cacheprovider", "no:hypothesispytest", "no:randomly")
-    command = [sys.executable, "-m", "pytest", "-q", *(f"-p{each}" for each in others), "."]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = run_pytest(tmp_path, "no:hypothesispytest", "no:randomly")
     assert "1 passed" in done.stdout, done.stdout + done.stderr
