@@ -1,11 +1,11 @@
 """Check during the experiment that a spatial arm's motion is consistent with some arm of the dry run's ensemble.
 
-The prior knowledge is the ensemble's mean and inflated covariance. While the arm is in its rest pose, something may
-support it, so no joint is judged. A joint that stands still at its rest angle may be lying against an end stop, so it
-is judged only while torque pushes it back towards the side from which it came. The same applies to a joint that has
-just returned to that angle, since it may have hit the end stop. A joint that has not yet left its rest angle may be
-lying against an end stop on the side towards which gravity pulls it. If such a joint fails to move towards that side,
-this is accepted, unless the commanded torque pushes it there as well.
+The prior knowledge is the ensemble's mean and inflated covariance. While the whole arm is in its rest pose, something
+may support it, so no joint is judged. A joint that stands still at its rest angle may be lying against an end stop. It
+is therefore judged only while torque pushes it back towards the side from which it came. The same applies to a joint
+that has just returned to its rest angle, since it may have hit the end stop. If a joint has not yet left its rest
+angle, the end stop may be on the side towards which gravity pulls the joint. The joint may then fail to move towards
+that side, unless the commanded torque pushes it there as well.
 """
 
 import math
@@ -92,7 +92,7 @@ class ChainWatch:
         self._velocity = np.zeros(n)
         """Latest velocities (joints,) [rad/s]."""
         self._hit_at, self._hit_speed = np.full(n, -np.inf), np.zeros(n)
-        """Time at which each joint may last have hit an end stop near its rest angle [s], and its speed before that
+        """Time of each joint's latest possible impact on an end stop near its rest angle [s], and its speed before that
         impact [rad/s].
         """
 
@@ -104,7 +104,7 @@ class ChainWatch:
 
     @property
     def residual(self) -> Residual:
-        """Torque in the latest sample that the model does not explain."""
+        """The part of the torque that the model does not explain, for the latest sample."""
         return Residual(self._observer.lacking, self._observer.torque, self._observer.is_beyond)
 
     def observe(self, state: State) -> int:

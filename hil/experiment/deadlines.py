@@ -40,7 +40,7 @@ class Deadlines:
         came.
         """
         self.any_missed = False
-        """Whether recently missed deadlines have not yet been offset by deadlines met since."""
+        """Whether there are missed deadlines that deadlines met since then have not yet offset."""
 
     def missed(self, seconds: float = 0.0, *, waited: bool = False) -> None:
         """Record a missed deadline, `seconds` after the last command.

@@ -1,10 +1,10 @@
 """Checks every sample and stops the arm when a limit is exceeded or a reply is inconsistent.
 
 The checks take a few us per sample. The per-joint checks form one compiled loop (`checks.joint_checks`), which also
-applies `following` (does the motor carry the commanded current), `consistency` (do position and velocity agree) and
-`work` (does the motor turn as commanded); `checks.joint_faults` explains what they find. Other modules check the status
-registers (`status_check`) and the time without commands or replies (`deadlines` and `silence`); `command_limits` clamps
-what is sent.
+applies `following` (whether the motor carries the commanded current), `consistency` (whether position and velocity
+agree) and `work` (whether the motor turns as commanded); `checks.joint_faults` explains the faults that these checks
+find. Other modules check the status registers (`status_check`) and the time without commands or replies (`deadlines`
+and `silence`); `command_limits` clamps what is sent.
 """
 
 from collections.abc import Callable, Sequence
@@ -61,7 +61,7 @@ class Guard:
     left_by_a_run: whether the arm is where an immediately preceding run left it. If that run was stopped at a limit, a
     joint may have come to rest slightly beyond it: such a joint may move back, but no farther out.
 
-    recent: the exchanges so far, if another guard has checked them.
+    recent: the exchanges so far, if another guard checked these.
 
     lowers_since: for an arm that is being lowered, the time of the last exchange that all servos answered [s]. Replies
     may then be missing for longer; temperatures, voltages and alerts are accepted as long as the servos keep their
@@ -183,7 +183,9 @@ class Guard:
         return self._status.is_in_doubt
 
     def _look_one_by_one(self, state: State, unsure: float) -> None:
-        """Check an exchange in which replies are missing or report errors, or the exchange that follows it."""
+        """Check the joints individually, in an exchange in which replies are missing or report errors, and in the next
+        one.
+        """
         now, missing, error = state.time_before_write, state.missing, state.error
         self._silence.ask(now)
         # While the arm is being lowered, waiting for replies may take up much of the allowed time.

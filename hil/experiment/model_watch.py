@@ -1,8 +1,8 @@
 """Check during the experiment that the motion is consistent with some arm of the dry run's ensemble.
 
 The prior knowledge is the same as in the dry run: an ensemble of arms from `[arm.prior]` or from an earlier result. Its
-mean and inflated covariance initialise `hil.estimator.models.momentum_observer`. Without link lengths, which a dry run
-needs too, only the planned torque is known: the first motion then trains the model, and only later motion is judged.
+mean and inflated covariance initialise `hil.estimator.models.momentum_observer`. Without link lengths, no dry run is
+possible, and only the planned torque is known: the first motion then trains the model, and only later motion is judged.
 """
 
 import math
@@ -69,7 +69,7 @@ _STEP_S = 0.02
 _LAG_S = 0.012
 """Time constant with which a torque step appears in the velocity [s], due to current loop and velocity filter."""
 _VAGUE_S = 0.004
-"""Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
+"""If an exchange takes longer than usual by more than this [s], the time of its measurement counts as unknown."""
 JOLT_S, JOLT_BACK_S = 0.01, 0.08
 """Time within which a slipping joint's velocity changes, and time within which it changes back [s]; below about 40 Hz,
 the latter is three sample intervals.
@@ -95,7 +95,7 @@ _USUAL_S = 1.0
 _GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which changes of velocity are not checked."""
 _WINDOW_S = 0.3
-"""Time span [s] for which a message about a stationary joint gives the torque range: one value alone may be near 0."""
+"""Time span [s] for which a message about a stationary joint gives the torque range; a single value might be near 0."""
 
 
 JOLT = np.dtype(
@@ -121,8 +121,9 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
 
     If the joint reverses in both changes, the motor has crossed the backlash of its gear twice in succession, which it
     does much faster than it can move the arm. This is not a jolt. In a gear with much backlash, a tooth that strikes
-    the opposite flank changes the velocity even without a reversal. Two such impacts may by chance look like a jolt.
-    Single impacts are much more frequent, so a jolt must exceed the largest of them.
+    the opposite flank changes the velocity even without a reversal. By chance, two such impacts may look like a jolt.
+    Since single impacts are much more frequent, a change of velocity counts as a jolt only if it exceeds the largest of
+    them.
 
     joints: records of type JOLT. former: the latest velocities (samples within `JOLT_S`, joints) [rad/s]. least:
     smallest change that counts as a jolt [rad/s]. longest: time within which the velocity jumps back [s].
@@ -244,8 +245,8 @@ class ModelWatch:
     """Checks every sample against the model.
 
     planned: largest goal of each joint [A, or V in PWM mode]. arms: prior knowledge of the arm; by default, from the
-    configuration. interval: time between two exchanges [s]; by default, the sample period. explain: raises
-    SafetyStop if the latest samples show why a moving joint lacks torque [N m].
+    configuration. interval: time between two exchanges [s]; by default, the sample period. explain: called with a
+    moving joint and its missing torque [N m]; raises SafetyStop if the latest samples explain it.
     """
 
     def __init__(
@@ -306,7 +307,9 @@ class ModelWatch:
         self._recent.append(state)
 
     def _judge(self, jolted: int, unlike: int, state: State) -> None:
-        """Judge the joint that jolted and the one whose motion is inconsistent (numbered from 1; 0 for none)."""
+        """Decide whether to stop the arm. jolted: joint that jolted. unlike: joint whose motion is inconsistent. Both
+        are numbered from 1; 0 means none.
+        """
         if jolted:
             self._check_displacement(jolted - 1, state)
         self._recent.append(state)

@@ -28,8 +28,7 @@ def read_back(bus: ServoBus, guard: Guard, due: float) -> None:
 class Pace:
     """Sends goals when they are due. Every method may raise the errors of `ServoBus.exchange`.
 
-    rate: samples per second. guard: receives the times at which this program wakes up, and reports of goals that do not
-    arrive.
+    rate: samples per second. guard: is told when this program wakes up, and which goals do not arrive.
     """
 
     def __init__(self, bus: ServoBus, rate: float, guard: Guard) -> None:

@@ -132,7 +132,8 @@ def run_experiment(
 
 @contextmanager
 def _with_torque(torque: str) -> Iterator[None]:
-    """Append the torque state to errors from closing the recording, and to stop requests deferred until then."""
+    """Append the torque state to errors raised while the recording is closed, and to stop requests deferred until then.
+    """
     try:
         yield
     except (RunFolderError, StopRequested) as error:
@@ -372,7 +373,8 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
     """Check that the arm is in its rest pose and that the servos of one joint agree; otherwise zero_ticks, direction or
     the arm's description is wrong.
 
-    After a run that passed this check, friction may hold the arm up to twice the tolerance away from it.
+    After an earlier run of the session, twice the tolerance is allowed, since friction may hold the arm away from its
+    rest pose.
     """
     if has_moved():
         _check_inside(config, bus)
@@ -396,7 +398,9 @@ def _positions(config: Config, bus: ServoBus) -> list[float]:
 
 
 def _from_where_it_lies(config: Config, plan: Plan, bus: ServoBus, run: RunFolder, note: Note) -> tuple[Config, Plan]:
-    """Replan a spatial arm's motion if the arm is not exactly in its rest pose; save the change for estimation."""
+    """If a spatial arm is not exactly in its rest pose, plan its motion from where it lies, and save that pose for the
+    estimation.
+    """
     lies = from_where_it_lies(config, bus.read_positions())
     if lies is config:
         return config, plan
@@ -409,8 +413,8 @@ def _from_where_it_lies(config: Config, plan: Plan, bus: ServoBus, run: RunFolde
 
 
 def _check_inside(config: Config, bus: ServoBus) -> None:
-    """Refuse an arm that the previous run left far beyond its limits, such as an upright one that fell without
-    torque.
+    """Refuse an arm that the previous run left far beyond its limits, such as an upright arm that fell when torque was
+    cut.
     """
     for joint, position, limited in zip(bus.joints, _positions(config, bus), config.joints, strict=True):
         low, high = limited.position_limit

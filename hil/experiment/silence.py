@@ -92,7 +92,8 @@ class Silence:
         now: when that exchange began, or when waiting for its replies ended [s].
 
         answered: whether the servo answered with an error instead of its state. refused: whether that error shows that
-        it received the request undamaged; one such answer is enough. alone: whether at least one other servo was heard.
+        it received the request undamaged; such an answer counts as two missing replies. alone: whether at least one
+        other servo was heard.
         """
         last = max(self._last_heard[joint], self._all_heard_at)
         if last == -inf:
@@ -115,8 +116,8 @@ class Silence:
         return None
 
     def _delayed(self, seconds: float) -> str:
-        """Attribute `seconds` [s] of a silence to this computer; "" if that is short or, during lowering, if the
-        computer is not known to be busy.
+        """Return a phrase that attributes `seconds` [s] of a silence to this computer. Returns "" if that time is short
+        or, while the arm is being lowered, if the computer is not known to be busy.
         """
         is_told = seconds >= LATE_WAKE_UP_S and (self.is_busy or not self._already)
         return f", {_ms(seconds)} of it because this computer was busy" if is_told else ""

@@ -36,8 +36,8 @@ _REMEMBERED = 256
 """Number of latest goals kept."""
 
 _LONGEST_DELAY_S = 0.1
-"""Longest assumed delay of requests [s]; if a goal that a servo reports equals one sent earlier than this, that counts
-as a coincidence.
+"""Longest assumed delay of requests [s]. If a servo reports a goal that was last sent longer ago than this, the
+agreement counts as a coincidence.
 """
 
 _HELD_BEFORE = 4
@@ -87,7 +87,7 @@ class StatusCheck:
         self._agreed_at = [0] * len(config.joints)
         self._is_foreign = [False] * len(config.joints)
         self._missed_at = [-1] * len(config.joints)
-        """Number of goals that had been sent when a status last differed, by joint."""
+        """Number of goals that had been sent when a joint's status last reported a different goal, by joint."""
         self._ticks = [(-1.0, 0.0)] * len(config.joints)
         """Servo's and computer's clock readings in the latest status [s], by joint."""
         self._foreign = [ForeignValues() for _ in config.joints]

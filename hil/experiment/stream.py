@@ -44,8 +44,8 @@ from hil.setup.session.servo_session import has_moved
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
 _STILL_STEPS, _FALSE_STEPS = 1, 4
-"""Largest change in the reading of a joint at rest, in encoder steps: the joint may rest between two steps. The second
-value is the distance, also in steps, to which reported velocities must add up before they count as false.
+"""The first value is the largest change in the reading of a joint at rest, in encoder steps: the joint may rest between
+two steps. Reported velocities count as false only if they add up to more than the second value, also in steps.
 """
 
 _BY_OTHER_GOALS = {
@@ -67,7 +67,7 @@ for late commands: if the cable is unplugged during braking, the current must no
 
 
 class Progress(NamedTuple):
-    """Progress for the user: number of samples taken and expected, phase, role of the multisine, and latest state."""
+    """What the user is shown: number of samples taken and expected, phase, role of the multisine, and latest state."""
 
     taken: int
     expected: int
@@ -175,7 +175,7 @@ class Stream:
             raise
 
     def _name_lost_torque(self, error: ExperimentError | BusOverheard) -> None:
-        """Raise SafetyStop instead of `error` if a servo that has lost its torque explains it."""
+        """If `error` is due to a servo that has lost its torque, raise a SafetyStop that says so."""
         is_explained = isinstance(error, DidNotMove | NotSettled)
         if not is_explained and not (isinstance(error, SafetyStop) and error.cause in _BY_LOST_TORQUE):
             return

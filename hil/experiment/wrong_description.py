@@ -37,7 +37,7 @@ def doubt_spatial_description(config: Config, error: BaseException, samples: NDA
     if changes := likely_mistakes(config, samples):
         said = ", or ".join(_said(config, each) for each in changes)
         stop.replace_remedy(
-            f"The arm's whole motion contradicts its description, which would explain it {said}. Compare the arm with "
+            f"The arm's whole motion contradicts its description, but would agree with it {said}. Compare the arm with "
             "its description, with torque off, before you look for a faulty servo."
         )
 

@@ -51,10 +51,11 @@ class Apart:
         self._first: dict[tuple[int, int], float] = {}
 
     def look(self, apart: Sequence[Sequence[float]]) -> tuple[int, int, float] | None:
-        """Process a sample. If two servos no longer agree, return the joint, the other servo (both counted from 0) and
-        the change [rad].
+        """Process a sample. If a servo no longer agrees with its joint's first servo, return the index of the joint,
+        the index of that servo among the joint's other servos, and the change of the difference [rad].
 
-        apart: angles of each joint's other servos minus the first's [rad], NaN if one did not reply.
+        apart: for each joint, the angles of its other servos minus that of the first [rad]; NaN if either did not
+        reply.
         """
         for joint, differences in enumerate(apart):
             for servo, difference in enumerate(differences):

@@ -14,8 +14,8 @@ accumulate in this difference. The contributions that a healthy servo makes to i
 - a velocity with a scale error: the same fraction of the distance covered within the memory, at most `SCALE`;
 - a velocity that is rounded towards zero, or always downwards (a servo may do either). In the slow memory, rounding
   towards zero adds one register step times the difference between the times of motion in the two directions. Rounding
-  downwards adds a bias of up to half a step times the time in motion, which is accepted unless the motion so far rules
-  it out (`hil.experiment.velocity.bias`). While the register shows zero, motion below one step does not count;
+  downwards adds up to half a step times the time in motion; this bias is accepted unless the motion so far rules it out
+  (`hil.experiment.velocity.bias`). While the register shows zero, motion below one step does not count;
 - the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where a
   fraction `CURVED` of the change of velocity times the interval remains. They do not cancel where the velocity jumps:
   in the slow memory, which contains many jumps, their sum is a random walk.
@@ -66,8 +66,8 @@ STDS = 2.0
 """Number of standard deviations by which the estimates of lag and scale error may be wrong."""
 
 BIAS_LAG_S, BIAS_SCALE, BIAS_LAG_SHARE = 0.002, 0.005, 0.1
-"""Used when checking for creep: errors added to the standard deviations of lag and scale error [s, 1], and the
-allowance for a lag that is not a pure delay, as a fraction of the lag times the range of velocities.
+"""Constants of the check for creep. The first two are added to the standard deviations of lag and scale error [s, 1].
+The last one allows for a lag that is not a pure delay, as a fraction of the lag times the range of velocities.
 """
 
 _LAG_SHARE = 0.25
@@ -87,19 +87,19 @@ latest three values span `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
-"""Velocity below which the reading may stay the same while a joint sticks and slips, and resolution of the reading
-[rad/s].
+"""Velocity below which the reading may stay the same while a joint sticks and slips, and resolution of the velocity
+register [rad/s].
 """
 
 LONGEST_GAP_S = 0.06
-"""If two exchanges are farther apart than this [s], the velocity in between is unknown. The interval at 20 Hz is
-shorter.
+"""If two exchanges are farther apart than this [s], the velocity in between counts as unknown. Even at 20 Hz, the
+interval is shorter.
 """
 
 SCALE, MORE_SCALE = 0.06, 0.02
 CURVED = 0.35
-"""Allowance for the velocity between samples, as a fraction of its change times the interval. A wave with only four
-samples per period, the fastest that is used, needs 0.27.
+"""Allowance for the velocity between samples, as a fraction of its change times the interval. The fastest wave that is
+used has only four samples per period and needs 0.27.
 """
 
 ROUGH_TIMES = 2.0
@@ -167,9 +167,9 @@ between samples since then. seen: `difference`, except for motion that is too sl
 position relative to a reference that follows such motion [rad]. headed: time of motion in the positive direction minus
 time of motion in the negative direction, since that update [s]. rough: sum of squares of the errors that velocity jumps
 may have caused since then [rad^2]. heading, roughness, moving: `headed`, `rough` and the time in motion, accumulated in
-the slow memory [s, rad^2, s]. learnt: information from which lag and scale error were estimated [rad^2/s]. lag, scale:
-their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the sums from which lag and
-scale error are estimated.
+the slow memory [s, rad^2, s]. learnt: information about the lag when lag and scale error were last estimated [rad^2/s].
+lag, scale: their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the sums from
+which lag and scale error are estimated.
 """
 
 
@@ -325,9 +325,9 @@ def _moved_at_rest(memory: Any, moved: float, seconds: float) -> float:
     """Process an interval in which the velocity reads zero; return the motion that contradicts this [rad].
 
     A reference follows the position at a speed of up to one step of the velocity register. Where this is too slow, the
-    reference jumps, so that it is never more than `STEP_RAD` away from the position. The jump is returned. Encoder
-    noise would accumulate in a sum of only the large position changes; it does not accumulate in these jumps, because
-    it always returns to its mean.
+    reference jumps, so that it is never more than `STEP_RAD` away from the position. The jump is returned. A sum of all
+    large position changes would accumulate encoder noise. A sum of these jumps does not, because the noise always
+    returns to its mean.
     """
     slow = RESOLUTION_RAD_S * seconds
     behind = memory.behind + moved
@@ -342,7 +342,8 @@ def _forget_sums(memory: Any) -> None:
 
 
 def _learn(memory: Any) -> None:
-    """Accept a multiple of the lag and scale error estimated so far, instead of the largest values for any servo."""
+    """From now on, accept a multiple of the estimated lag and scale error instead of the largest values of any servo.
+    """
     lags = memory.lags
     memory.learnt = lags.information
     memory.lag = min(LAG_S, 2.0 * max(lags.lag, 0.0) + MORE_LAG_S + STDS * lags.lag_std)

@@ -1,7 +1,7 @@
 """Noise of the current readings, measured while the arm rests, and its effect on the check of the current.
 
-The thresholds of `following` assume no more noise than usual. A noisier sensor gets wider thresholds, so that a healthy
-motor is not stopped.
+The thresholds of `following` assume no more noise than usual. If a sensor is noisier, its thresholds are widened, so
+that a healthy motor is not mistaken for a faulty one.
 """
 
 from collections import deque

@@ -23,8 +23,8 @@ stay exactly the same although the goals that they may reflect (those of the las
 frozen. A constant sensor error cancels in this comparison.
 
 A current sensor may be noisier than assumed. Its noise is therefore measured at constant goals, while the arm rests
-before the start (`current_noise`), and sigma is at least as large as this noise. With a noisy sensor, lost torque is
-thus detected later, but a healthy motor is not stopped.
+before the start (`current_noise`), and sigma is at least as large as this noise. With a noisy sensor, a loss of torque
+is thus detected later, but a healthy motor does not stop the run.
 
 Part of the compiled loop `joint_checks`; a record of type `MEMORY` holds a joint's state.
 """
@@ -60,7 +60,8 @@ LEAST_RATIO = 10.0
 """Log likelihood ratio at which a current counts as zero, however low the rate."""
 
 NOISY_RATIO = 16.0
-"""Replaces `LEAST_RATIO` if the sensor's measured noise exceeds the usual assumption; most sensors have far less noise.
+"""Replaces `LEAST_RATIO` if the measured noise of a sensor exceeds what is usually assumed; most sensors have far less
+noise than that.
 """
 
 _FEWEST = 2
@@ -102,7 +103,7 @@ MEMORY = np.dtype(
 per_square: 1 / (2 sigma^2). least_ratio: log likelihood ratio at which a current counts as zero. allowed: accepted
 deviation [A or V]; share: the same, relative to the goal; follow_time: how long a larger deviation may last [s].
 evidence, ratio, count: sums of the log likelihood ratios, weighted by time [s] and unweighted, and their number.
-differs_for, differs: duration [s] and number of samples of a deviation.
+differs_for, differs: duration [s] of the present deviation and its number of samples.
 """
 
 

@@ -27,7 +27,9 @@ FARTHER_OUT_RAD = 0.01
 """How much farther out a joint may move if an earlier run left it beyond its limit [rad]."""
 
 MOST_OUTSIDE_RAD = 0.5
-"""How far beyond its limit a joint may start if an earlier run left it there [rad]: a light arm may coast past it."""
+"""How far beyond its limit a joint may start if an earlier run left it there [rad]: a light arm may coast past the
+limit.
+"""
 
 LONG_GAP = 3.0
 """If the gap between two samples is longer than this [sample intervals], the motion in between is too uncertain to
@@ -80,15 +82,15 @@ class JointChecks:
     def look(self, state: State, unsure: float) -> int:
         """Check all joints; each of them must have replied in this exchange and in the previous one.
 
-        Returns FINE, or CHECKS * joint + the number of the failed check for the first joint that fails one; later
-        joints are not checked. unsure: excess duration of the exchange [s].
+        Returns FINE if every joint passes. Otherwise, returns CHECKS * joint + the number of the failed check, for the
+        first joint that fails; later joints are not checked. unsure: excess duration of the exchange [s].
         """
         before, after, goal, current, velocity, position, _, _, _, _, _ = state
         self._pack(self._bytes, 0, *position, *velocity, *goal, *current)
         return self._check(self.joints, self._sample, 0, self._count, before, after, self.interval, unsure, 0)
 
     def look_at(self, joint: int, state: State, unsure: float, missed: int) -> int:
-        """Check one joint whose last `missed` replies were missing. Returns the same as `look`."""
+        """Check one joint, whose last `missed` replies were missing. Returns the same as `look`."""
         before, after, goal, current, velocity, position, _, _, _, _, _ = state
         self._pack(self._bytes, 0, *position, *velocity, *goal, *current)
         only = joint, joint + 1

@@ -46,8 +46,8 @@ class SwappedReplies:
         self._drives = [joint.drives for joint in joints]
 
     def look(self, joint: int, now: State, before: Sequence[State | None]) -> tuple[int, int] | None:
-        """Return the IDs of two servos that have exchanged positions, the first of which belongs to this joint; None if
-        there are none.
+        """Return the IDs of two servos that have exchanged positions, beginning with the one of this joint; None if
+        none of its servos has.
 
         now: the latest exchange. before: for each joint, the previous exchange that it answered, or None.
         """
@@ -75,7 +75,7 @@ def _ticks(drive: Joint, angle: float) -> float:
 
 
 def _have_exchanged(own: _Seen, other: _Seen) -> bool:
-    """Whether each of two servos is now at the other's former position; False if a position is NaN."""
+    """Whether each of the two servos is now at the other's former position; False if any position is NaN."""
 
     def distance(first: float, second: float) -> float:
         # Within one turn, because a joint's zero may be shifted by whole turns when the bus is opened.

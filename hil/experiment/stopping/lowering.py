@@ -1,10 +1,10 @@
 """Stops an arm that cannot hang freely: brakes it, then lowers it to its rest pose for as long as its servos accept
 commands.
 
-The feed-forward torque is combined with the stabiliser's spring and damper, which track the path to the rest pose;
-while a joint is off the path, an additional torque towards the path grows. Lowering is monitored like the experiment;
-torque is also cut if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities that
-agree with the positions.
+The feed-forward torque is combined with the stabiliser's spring and damper, which track the path to the rest pose.
+While a joint is off the path, an additional torque pulls it towards the path and grows with time. Lowering is monitored
+like the experiment; torque is also cut if a motor turns against its goals (`hil.plan.obedience`). The damper acts only
+on velocities that agree with the positions.
 
 Replies may be missing for a moment, even at the beginning: joints that do not reply get only the feed-forward torque.
 """

@@ -1,10 +1,10 @@
 """Bounds on the bias of a servo's velocity reading, inferred from its positions.
 
-A bias of the velocity, for example because a register is rounded downwards, makes the position depart from the integral
-of the velocity in proportion to the time in motion, as creep does. But a servo's bias is constant: initially it may be
-plus or minus half a step, and every sample of a run narrows this range, since position and integral cannot be farther
-apart than bias times time plus known errors. Creep that begins later cannot widen it. If no bias in the range explains
-the distance to within twice these errors, the position creeps.
+A biased velocity, for example from a register that is rounded downwards, makes the position depart from the integral of
+the velocity in proportion to the time in motion, as creep does. But a servo's bias is constant. At first, it may be
+anything up to plus or minus half a step. Every sample of a run narrows this range, since position and integral cannot
+be farther apart than bias times time plus known errors. Creep that begins later cannot widen the range. If no bias in
+the range explains the difference to within twice these errors, the position creeps.
 """
 
 from typing import Any
