@@ -1,8 +1,9 @@
-"""Breakaway of joints held by friction: torque rises from run to run, and a run ends soon after a joint moves.
+"""Make joints that friction holds break away: torque rises from run to run, and a run ends soon after such a joint
+moves.
 
-Just above a joint's static friction, motion grows quickly: on many of the plausible arms even a few percent more torque
-makes a joint exceed a limit. The guard is therefore given narrow position limits for such joints, and the torque is
-raised by a constant ratio from run to run, up to the current limit. As soon as the joint moves and so reveals its
+Just above a joint's static friction, motion grows quickly: in many of the plausible arms, even a few percent more
+torque makes a joint exceed a limit. The guard is therefore given narrow position limits for such joints, and the torque
+is raised by a constant ratio from run to run, up to the current limit. As soon as the joint moves and so reveals its
 friction, the arm is braked and the run ends.
 
 A joint that gravity presses against an end stop also stands still until its torque lifts it. In the following runs, it
@@ -73,7 +74,9 @@ def broke_free(config: Config, narrow: Config, seen: Array) -> Mask:
 
 
 def resting_on_stop(config: Config, seen: Seen) -> str:
-    """Return sentences if a joint of a planar arm rests on something and can move in one direction only; else ""."""
+    """Return a message if a joint of a planar arm rests against something, so that it can move in one direction only;
+    otherwise "".
+    """
     leans = any(abs(math.cos(angle)) > _LEANS for angle in np.cumsum(config.arm.rest_pose))
     if config.arm.gravity == 0.0 or not leans:
         return ""

@@ -33,13 +33,15 @@ _LEAST_NOISE_SHARE = 0.005  # smallest noise, relative to a joint's largest torq
 _MODEL_SPREAD = 0.01  # of each parameter of links and drives, for effects that the model does not include
 _FEWEST_ROWS = 50
 _PEAK, _BREAKAWAY = 0.99, 1.15
-"""The dry friction of a joint that did not move is at least `_BREAKAWAY` times the quantile `_PEAK` of its torque."""
+"""If a joint did not move, its dry friction is assumed to be at least `_BREAKAWAY` times the quantile `_PEAK` of its
+torque.
+"""
 _LEAST_FRICTION_SHARE = 1e-4
 _POSES = 12
 _HALVINGS = 6
 _LIGHTER, _LIGHTER_THAN_MEAN = 0.25, 0.5
-"""Lower bound on the inertia of a joint, as fractions of its inertia in the lightest arm of the prior and in the arm
-with the fitted parameters; the smaller of the two values applies.
+"""The inertia of a joint must be at least the smaller of two values: the first fraction of its inertia in the lightest
+arm of the prior, and the second fraction of its inertia in the arm with the fitted parameters.
 """
 
 SIMULATED = 100
@@ -189,7 +191,7 @@ def _poses(config: Config) -> Array:
 def _rows(arms: ChainArms, config: Config, samples: NDArray[np.void]) -> tuple[Array, Array] | None:
     """Regressor (joints, rows, parameters) and commanded torque (joints, rows) [N m] while the arm moves.
 
-    None if the recording is too short.
+    Returns None if the recording is too short.
     """
     rate, n = config.experiment.rate, len(config.joints)
     phases = (Phase.RAMP_IN, Phase.PERIODIC, Phase.RAMP_OUT)

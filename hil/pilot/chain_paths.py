@@ -1,4 +1,6 @@
-"""Paths for the runs of a spatial arm's pilot: designed once for all steps, and scaled down in the first ones."""
+"""Paths for the runs of a spatial arm's pilot. They are designed once for all steps, and scaled down for the early
+steps.
+"""
 
 from dataclasses import dataclass
 
@@ -40,14 +42,16 @@ class Reserve:
     clearance: float = 0.01
 
     def larger(self, shortage: float) -> "Reserve":
-        """Return a larger reserve. shortage: shortfall of the predicted clearance [m], or 0."""
+        """Return a larger reserve. shortage: by how much the predicted clearance is too small [m]; 0 if it is
+        sufficient.
+        """
         position = min(MORE * self.position, MOST_POSITION)
         return Reserve(position, self.speed / MORE, self.torque / MORE, self.clearance + shortage)
 
 
 MORE = 1.4
 MOST_POSITION = 0.3
-"""Largest value of Reserve.position: at 0.5, none of a joint's range would be left."""
+"""Largest value of Reserve.position; a value of 0.5 would leave nothing of a joint's range."""
 RESERVE = Reserve()
 
 

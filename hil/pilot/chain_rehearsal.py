@@ -27,9 +27,9 @@ def rehearse(
 ) -> ChainDryRun:
     """Simulate the configured path, or the pilot's first step as `hil identify` would choose it.
 
-    Arms that `SafeShares` does not simulate have no effect except on the peaks that are shown. tell, designing: called
-    with the progress of each simulation and of each path's design. Raises ConfigError, NoSafeTorque; with `servos`,
-    DriverError.
+    Arms beyond those that `SafeShares` simulates do not affect the choice, only the peaks that are shown. tell,
+    designing: called with the progress of each simulation and of each path's design. Raises ConfigError, NoSafeTorque;
+    with `servos`, DriverError.
     """
     check_rest_pose(config)
     said = quiet_stream(config) if servos else ()

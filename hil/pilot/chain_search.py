@@ -36,7 +36,9 @@ from hil.setup.unmoved import wait_for_rest
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7
 RAISED = 1.3
-"""If the amplitude that is safe now is at least this multiple of the last run's, another step precedes the full run."""
+"""If the amplitude that is safe now is at least this multiple of the amplitude of the last run, another step precedes
+the full run.
+"""
 
 MOST_RAISE = 2.5
 """Largest ratio of the amplitudes of successive runs."""
@@ -134,10 +136,10 @@ class ChainSearch(SafeShares):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
-        """Play a run and set `last` to the fraction of the amplitude that it used; return the error that ended it
-        early, or None.
+        """Play a run, and set `last` to the fraction of the amplitude that the run used. Return the error that ended
+        the run early, or None.
 
-        Only errors that are informative about the arm are returned; all others are raised.
+        Errors that are informative about the arm are returned; all others are raised.
         """
         error, self.last = None, found.share
         try:
@@ -218,7 +220,8 @@ def identify_chain_in_steps(
 def _full(search: ChainSearch) -> str:
     """Play the full run; repeat it with a smaller amplitude if it exceeds a limit or never settles.
 
-    If the last run fails only in its second path, which serves only for validation, the first path suffices.
+    If the last run fails only in its second path, the estimate uses the first path alone: the second one is needed only
+    for validation.
     """
     tries = 3
     for number in range(1, tries + 1):

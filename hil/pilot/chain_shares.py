@@ -40,12 +40,12 @@ OTHER_SEEDS = 2
 _NEXT_SEED = 100
 
 MOST_SIMULATED_S = 60_000.0
-"""A search tries no further paths after it has simulated this much motion [s], summed over all arms: about a minute of
-processor time with six joints.
+"""A search tries no further paths after it has simulated this much motion [s], summed over all arms: this takes about a
+minute of processor time with six joints.
 """
 
 STOPPED_SHARE = 0.5
-"""Computing time of a simulated stop, relative to that of one arm on a path and its transitions."""
+"""Computing time for simulating a stop, relative to the time for simulating one arm on a path with its transitions."""
 
 RAISED_RATE = 1.6
 """First rate tried when searching for a higher one to recommend, relative to the configured rate."""
@@ -93,7 +93,7 @@ class SafeShares:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether so much motion has been simulated that no further paths should be tried."""
+        """Whether the search has simulated so much motion that it should try no further paths."""
         return self.simulated > MOST_SIMULATED_S
 
     @property
@@ -210,8 +210,8 @@ class SafeShares:
         return found, why
 
     def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
-        """Return the first safe fraction of the amplitude, why a larger one is unsafe, and the clearance that the
-        larger one lacks [m].
+        """Return the first safe fraction of the amplitude, why a larger one is unsafe, and by how much the clearance of
+        the larger one is too small [m].
 
         If neither the first nor the last fraction is safe when tried on a few arms, those in between are not tried.
         """
@@ -233,7 +233,7 @@ class SafeShares:
         return found, why, shortage
 
     def _found(self, config: Config, share: float, which: str) -> tuple[Found | None, str, float]:
-        """Return this fraction if it is safe, otherwise why it is not and how much clearance it lacks [m]."""
+        """Return this fraction if it is safe; otherwise, why it is not, and by how much its clearance is too small [m]."""
         shortage = 0.0
         for count in (SEARCH_ARMS, ARMS):
             found, why, lacking = self._unsafe(config, share, count, which)
@@ -245,8 +245,8 @@ class SafeShares:
         return (None if why else found), why, shortage
 
     def _unsafe(self, config: Config, share: float, count: int, which: str) -> tuple[Found | None, str, float]:
-        """Simulate a fraction of the amplitude on some arms; return the prediction, why it is unsafe, and what
-        clearance it lacks [m].
+        """Simulate a fraction of the amplitude on some arms. Return the prediction, why this fraction is unsafe, and by
+        how much its clearance is too small [m].
         """
         if self.trying is not None:
             most = (1 + OTHER_SEEDS) * (1 + REDESIGNS)

@@ -1,8 +1,8 @@
 """Gains of a software spring and damper for an arm that does not return to its rest pose: horizontal, upright, or with
 so much friction that gravity cannot move a joint.
 
-The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction within a radian,
-and soft enough to leave most of the torque for the excitation.
+The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction at a deflection of
+less than a radian. It is soft enough to leave most of the torque for the excitation.
 
 At a low sample rate, such a spring would act so late that the joint would oscillate (`hil.plan.stabiliser`). The damper
 is then made stronger and the spring softer, as far as rate and gravity allow.
@@ -59,7 +59,7 @@ def with_stabiliser(config: Config, belief: Belief, springs: Mask | None = None)
 
 
 def proposed(config: Config, belief: Belief, springs: Mask) -> StabiliserConfig:
-    """Gains suitable for the arms of `belief`, 0 for joints without a spring."""
+    """Gains suitable for the arms of `belief`; 0 for joints without a spring."""
     parameters = belief.parameters
     away = np.max([_pull_away(config, each) for each in parameters], axis=0)
     inertia = np.median([_inertia(config, each) for each in parameters], axis=0)

@@ -51,7 +51,7 @@ def rehearse_in_steps(
 
 
 def _largest(held: Config, ensemble: Ensemble, executor: Executor | None) -> Amplitude | None:
-    """The largest torque that is safe for every arm; None if there is none and only a pilot can find a safe torque."""
+    """The largest torque that is safe for every arm; None if no torque is, in which case only a pilot can find one."""
     try:
         found = largest_amplitude(held, ensemble, executor=executor)
     except NoSafeTorque:

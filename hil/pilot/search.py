@@ -31,7 +31,9 @@ from hil.runs.run_folder import RunFolder
 DEFAULTS = PilotOptions()
 
 _LINES_FOR_DETECTION = 4
-"""Minimum number of spectral lines per joint in the band if experiment.detection leaves some lines unexcited."""
+"""If experiment.detection leaves some spectral lines unexcited, the band must contain at least this many lines per
+joint.
+"""
 
 
 @dataclass
@@ -61,8 +63,8 @@ class Search:
     fast: Mask = field(init=False)
     """Joints that exceeded their velocity limit in the last run before moving by MOVED_STEPS (joints,)."""
     calm: Array = field(init=False)
-    """Cap on the torque (joints,) [N m]: it is lower than in all runs in which a joint exceeded its velocity limit
-    before moving by MOVED_STEPS; infinite if there were no such runs.
+    """Cap on the torque (joints,) [N m]: below the torque of every run in which a joint exceeded its velocity limit
+    before moving by MOVED_STEPS; infinite if there was no such run.
     """
 
     def __post_init__(self) -> None:
@@ -393,7 +395,9 @@ def _from_anywhere(config: Config) -> Config:
 
 
 def _within_limits(config: Config, pose: Array, inside: float) -> Array:
-    """Clip the pose of an arm that a stopped run may have left beyond its limits: the next run moves it inwards."""
+    """Clip the pose of an arm that a stopped run may have left beyond its position limits: the next run will move it
+    inwards.
+    """
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     return np.asarray(np.clip(pose, middle - inside * half, middle + inside * half))

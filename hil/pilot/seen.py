@@ -36,7 +36,7 @@ class Seen:
 
 
 def seen_of(config: Config, samples: NDArray[np.void]) -> Seen | None:
-    """Extract the ramp and the first period of a recording; None if it is too short."""
+    """Extract the ramp and the first period of a recording; return None if the recording is too short."""
     before = np.nonzero(samples["phase"] == Phase.REST)[0]
     played = (samples["phase"] == Phase.RAMP_IN) | (samples["phase"] == Phase.PERIODIC)
     rows = np.nonzero(played & (samples["segment"] == 0) & (samples["period"] < 1))[0]

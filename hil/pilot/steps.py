@@ -162,7 +162,9 @@ def tells_of_the_arm(error: ExperimentError) -> bool:
 
 
 def _stood_still(config: Config, folder: RunFolder, error: ExperimentError) -> bool:
-    """Whether the only anomaly was that a joint did not move at all, because friction is larger than assumed."""
+    """Whether the only deviation from the prediction was that a joint did not move at all, because friction is larger
+    than assumed.
+    """
     if not isinstance(error, SafetyStop) or error.cause is not Cause.UNEXPECTED or error.overruled:
         return False
     position = load_samples(folder.samples_path, len(config.joints))["position"]

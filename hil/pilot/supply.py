@@ -22,7 +22,7 @@ _LAST_S = 0.25
 
 def delivered_speed(config: Config, samples: NDArray[np.void]) -> Array:
     """Speed (joints,) [rad/s] up to which the supply can drive the commanded currents, learned from a run that was
-    stopped because it could not do so. Infinite for joints whose currents followed their goals.
+    stopped because the supply could not drive them. Infinite for joints whose currents followed their goals.
     """
     driven = samples[np.isin(samples["phase"], _DRIVEN)]
     last = driven[-max(2, math.ceil(_LAST_S * config.experiment.rate)) :]

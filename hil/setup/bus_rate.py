@@ -25,7 +25,7 @@ USUAL = 0.9
 exchanges on time.
 """
 PATIENCE_S = 0.05
-"""Time after which a reply counts as lost [s]; on a busy computer the kernel may deliver a reply 10 to 20 ms late."""
+"""Time after which a reply counts as lost [s]. On a busy computer, the kernel may deliver a reply 10 to 20 ms late."""
 AGAIN_AFTER_S = 0.5
 """If the configured rate seems too high for the bus, the bus is measured again after this time [s]."""
 SHARE = 0.9
@@ -85,7 +85,7 @@ class RateReport:
     """Measurements of all exchange modes.
 
     found: what the configured mode can sustain, as text. fix: what to change; empty if the exchanges are fast enough.
-    doubt: why deadlines may nevertheless be missed, and what to do about it; empty if there is no reason.
+    doubt: why deadlines may nevertheless be missed, and what to do about it; empty if nothing suggests this.
     """
 
     modes: tuple[ExchangeMode, ...]
@@ -115,7 +115,7 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
 
 
 def seldom_as_measured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> str:
-    """Call `seldom_read_back` with the measured timing of the configured exchange mode, and return its warning. Raises
+    """Return the warning of `seldom_read_back` for the measured timing of the configured exchange mode. Raises
     DriverError.
     """
     used = _configured(bus, modes)
@@ -125,8 +125,7 @@ def seldom_as_measured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> str:
 
 
 def seldom_read_back(bus: ServoBus, exchange: ReadBackExchange, off_wire: float) -> str:
-    """Return a warning that cycles leave too little time to read back goals and torque regularly; "" if there is
-    enough time.
+    """Return a warning if cycles leave too little time to read back goals and torque regularly, otherwise "".
 
     off_wire: duration of an exchange in addition to its wire time [s].
     """
@@ -174,7 +173,7 @@ def choose_mode(bus: ServoBus, modes: Sequence[ExchangeMode], rates: Sequence[fl
 
 
 def _configured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> ExchangeMode:
-    """The mode that a run would use: servos without Fast Sync Read are read without it."""
+    """The mode that a run would use. Servos that do not support Fast Sync Read are read with Sync Read."""
     fast = bus.config.fast_sync_read and any(mode.fast for mode in modes)
     return next(mode for mode in modes if (mode.one_write, mode.fast) == (bus.config.one_write, fast))
 
@@ -201,7 +200,7 @@ def goals_taken(bus: ServoBus) -> list[Joint]:
 
 
 def _give_back(bus: ServoBus, goals: Sequence[int]) -> None:
-    """Restore the goals of all servos that can be reached; raise the first DriverError after trying all."""
+    """Try to restore the goals of all servos; if any of them failed, then raise the first DriverError."""
     failures: list[DriverError] = []
     for (drive, servo), goal in zip(bus.drives.items(), goals, strict=True):
         try:

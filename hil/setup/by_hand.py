@@ -48,13 +48,14 @@ class Moved:
     """Angle by which each joint moved [rad]."""
     well: bool
     found: str
-    """Finding as text; if the motion differs from the description, also what to change."""
+    """The finding as text. If the motion differs from the description, the text also says what to change."""
 
 
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
     """Return the pose of the arm at these joint angles [rad].
 
-    Whole turns, which a servo does not count while it is off, are removed if the position limits reveal them.
+    A servo does not count whole turns while it is off. An angle outside the position limits is shifted by whole turns
+    to lie within them.
     """
     limits = [joint.position_limit for joint in config.joints]
     angles = tuple(within_limits(*each) for each in zip(angles, limits, strict=True))

@@ -15,11 +15,11 @@ __all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "may_be_later
 
 _MODE, _DELAY = "Operating Mode", "Return Delay Time"
 _GOAL_PWM = "Goal PWM"
-"""Register that limits the voltage in current mode. After the watchdog has tripped, a value of 0 proves nothing."""
+"""Register that limits the voltage in current mode. A value of 0 proves nothing if the watchdog has tripped."""
 
 _BESIDE = frozenset({*PROTECTIVE, STATUS_LEVEL}) - {SECONDARY_ID}
-"""Settings that cannot explain why a run was stopped (except a Status Return Level of 0), but are named along with
-others that can.
+"""Settings that are named only along with others. They cannot explain why a run was stopped, except that a Status
+Return Level of 0 can.
 """
 
 _REGISTERS = (
@@ -64,8 +64,8 @@ _AT_A_LIMIT = frozenset({Cause.POSITION, Cause.VELOCITY})
 """Reasons for stopping a run that may be due to excessive torque alone."""
 
 _MODES_SEEN_S = 0.06
-"""If the operating modes were read back less than this time [s] before the run was stopped, a mode that differs may
-have been changed afterwards.
+"""If the operating modes were last read back within this time [s] before the run was stopped, a mode that now differs
+may have been changed after the stop.
 """
 
 Settings = Mapping[tuple[Joint, str], int]
@@ -98,7 +98,7 @@ def settings_now(bus: ServoBus, before: Settings | None = None) -> Settings:
 
 
 def _confirmed(bus: ServoBus, before: Settings, found: Settings) -> Settings:
-    """Return `found` without values that differ from `before` and that `Servo.read_surely` does not confirm."""
+    """Return `found` without the values that differ from `before` unless `Servo.read_surely` confirms them."""
     kept = dict(found)
     for (joint, register), value in found.items():
         if before.get((joint, register), value) == value or bus.drives[joint].answered_pings_only:

@@ -14,7 +14,9 @@ _FASTEST = 10.0  # rad/s, initial limit of servos that could turn faster
 _USUAL_STALL = 4.1  # N m, stall torque of an XM430
 _CYCLE_BYTES = 39  # per servo on the wire: goal, request and reply
 RATES = (400, 300, 250, 200, 160, 125, 100, 80, 64, 50, 40, 32, 25, 20)
-"""Sample rates [Hz] for a new file, spaced so that rounding down costs at most a quarter of the possible rate."""
+"""Sample rates [Hz] for a new file. They are so closely spaced that rounding down to one of them costs at most a
+quarter of the possible rate.
+"""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ class ArmAnswers:
 
 
 def usual_length(model: str) -> float:
-    """Typical length [m] of a link driven by a servo of this model, as a default."""
+    """Typical length [m] of a link that is driven by a servo of this model; used as the default answer."""
     stall: float = stall_torque(servo_model(model))
     return float(round(0.13 * (stall / _USUAL_STALL) ** 0.4, 2))
 

@@ -91,8 +91,8 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
 
 
 def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: Ask, say: Say) -> list[int]:
-    """Return the Present Positions in the rest pose. The pose of a hanging arm is read twice, the second time after a
-    push, since friction may hold its joints away from the vertical.
+    """Return the Present Positions in the rest pose. Friction may hold the joints of a hanging arm away from the
+    vertical, so they are read again after each has been pushed to the other side.
     """
     ask(_POSE[stance], "")
     first = [servo.read("Present Position") for servo in handles]

@@ -25,7 +25,9 @@ NEAR_RAD = 0.02
 """Largest deviation from arm.rest_pose at which it is still used as the rest pose [rad]."""
 
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
-"""Smallest reported motion after torque is cut, and largest deviation from the rest pose before torque is cut [rad]."""
+"""Motion after torque is cut is reported only if it exceeds the first value and if the arm was within the second value
+of its rest pose [rad].
+"""
 
 _LONGEST_SAG_S = 3.0  # longest wait for an arm that moves after torque is cut
 
@@ -79,7 +81,7 @@ def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
 
 
 def said_of_the_rest(config: Config, lies: Config) -> str:
-    """Return a sentence saying that the arm does not lie in its rest pose, with its actual angles."""
+    """Return sentences saying that the arm does not lie in arm.rest_pose and at which angles its joints are instead."""
     each = zip(config.joints, lies.arm.rest_pose, config.arm.rest_pose, strict=True)
     away = [
         f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})"

@@ -9,17 +9,17 @@ from hil.drivers.bus import ServoBus
 __all__ = ["mirrored_pairs"]
 
 _DISAGREE_RAD, _AGREE_RAD = 0.5, 0.25
-"""Angles of two servos that differ by more than the first value contradict each other; those that differ by less than
-the second agree.
+"""If the angles of two servos differ by more than the first value, they contradict each other; if they differ by less
+than the second, they agree.
 """
 
 
 def mirrored_pairs(config: Config, bus: ServoBus) -> Iterator[str]:
     """Yield one sentence for each joint whose servos have the same direction although they read as mirror images.
 
-    The second servo's horn may be mounted at any angle, so that a difference alone proves nothing. But two servos on
-    one joint rarely turn the same way, and it is unlikely that such a pair reads as mirror images by chance. Raises the
-    errors of `Servo.read`.
+    The second servo's horn may be mounted at any angle, so a difference alone proves nothing. But two servos on one
+    joint rarely turn the same way, and two that do are unlikely to read as mirror images by chance. Raises the errors
+    of `Servo.read`.
     """
     for described, joint in zip(config.joints, bus.joints, strict=True):
         if len(described.ids) == 1 or len(set(described.directions)) > 1:

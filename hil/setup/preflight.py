@@ -60,7 +60,7 @@ def check_arm(config: Config) -> Iterator[Finding]:
 
 
 def _torque_of_pilot(config: Config) -> Iterator[Finding]:
-    """Report a torque setting that the pilot ignores, or that is missing although there is no pilot."""
+    """Report experiment.peak_torque if a pilot would ignore it, or if it is missing although there is no pilot."""
     if config.experiment.pilot and config.experiment.peak_torque is not None:
         fix = (
             "`hil identify` ignores peak_torque: the pilot finds the torque, up to current_limit or voltage_limit. "
@@ -120,7 +120,7 @@ def _latency_timer(bus: ServoBus) -> Finding:
 
 
 def _slow_adapter(bus: ServoBus) -> Iterator[Finding]:
-    """Report an adapter that is slower than its kind; all later timeouts allow for its delay."""
+    """Report an adapter that is slower than others of its kind; all later timeouts allow for the delay."""
     what = "adapter"
     try:
         bus.learn_latency()
@@ -172,7 +172,9 @@ def _pairs(config: Config, bus: ServoBus) -> Iterator[Finding]:
 
 
 def _still_off(bus: ServoBus) -> Iterator[Finding]:
-    """Report torque that was switched on after the servos were checked: this check switches it neither on nor off."""
+    """Report servos whose torque was switched on after they were checked. This check itself switches torque neither on
+    nor off.
+    """
     try:
         on = switched_on(bus.drives)
     except DriverError as error:

@@ -1,4 +1,4 @@
-"""Linux real-time settings for the control loop: requested, used if granted, and reported either way.
+"""Request Linux real-time settings for the control loop, and report whether each was granted.
 
 no garbage collection  Python's collector is off inside the loop, and existing objects are frozen
 locked memory          mlockall: no page of this process is swapped in during a cycle
@@ -52,7 +52,7 @@ def real_time() -> Iterator[list[Granted]]:
 
 @contextmanager
 def on_time(clock: Clock) -> Iterator[list[Granted]]:
-    """With a wall clock, act as `real_time` does. On a virtual clock, nothing can be late, so nothing is requested."""
+    """With a wall clock, act as `real_time` does. With a virtual clock, nothing can be late, so nothing is requested."""
     if isinstance(clock, WallClock):
         with real_time() as granted:
             yield granted

@@ -23,8 +23,8 @@ _PATIENCE_S = _SLOT_S * (MAX_ID + 1)
 _STATUS_BYTES = 14
 
 _DIFFERENT = ("Present Position", "Realtime Tick")
-"""Registers that hardly ever have the same value on two servos. If two servos have the same ID, equal replies merge
-into one, but different ones corrupt each other.
+"""Registers that hardly ever have the same value on two servos. If two servos have the same ID, equal replies look like
+one reply, but different replies corrupt each other.
 """
 
 
@@ -54,8 +54,8 @@ class Found(NamedTuple):
 class Heard(NamedTuple):
     """The replies at one baud rate.
 
-    baud: over TCP, the baud rate that the servos report, or the port's if none answered. trouble: description of a
-    problem on the whole bus; empty if there is none.
+    baud: over TCP, the baud rate that the servos report or, if no servo answered, that of the port. trouble:
+    description of a problem on the whole bus; empty if there is none.
     """
 
     baud: int

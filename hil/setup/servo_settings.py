@@ -21,7 +21,7 @@ POWER_CYCLE = (
     "Power-cycle the servo. Its Operating Mode and limits stay as that program set them: check them with DYNAMIXEL "
     "Wizard 2.0."
 )
-"""What to do about torque that a terminated program left on and whose former settings are not on file."""
+"""What to do if a terminated program left torque on and the servo's former settings are not on file."""
 
 _PING_ONLY = load_control_table("XM430-W350")
 # Model Number, ID and similar registers have the same addresses in every X-series table.

@@ -1,8 +1,8 @@
-"""Wait until the arm is at rest, and check that it then stays in the pose in which it was first read until torque is
-switched on.
+"""Wait until the arm is at rest. Until torque is switched on, check that the arm is still in the pose in which it was
+first read.
 
-If its reported angles change, they are no longer correct: a horn has slipped, another servo answers, or another program
-has changed Homing Offset.
+If the reported angles of an arm at rest change, they can no longer be trusted: a horn may have slipped, another servo
+may be answering, or another program may have changed Homing Offset.
 """
 
 import math

@@ -100,7 +100,7 @@ def is_left_on(servo: Servo, kept: Kept) -> bool:
     """Return whether the killed program left this servo's torque on. Raises the errors of `Servo.read`.
 
     If torque is on in a mode other than that program's, another program has switched it on since. Torque that was
-    already on when the arm was taken over is not the killed program's.
+    already on when the killed program took the arm over does not count as left on by it.
     """
     if kept.was_held:
         return False
@@ -108,8 +108,8 @@ def is_left_on(servo: Servo, kept: Kept) -> bool:
 
 
 def half_let_down(kept: Kept, servo: Servo) -> str:
-    """Say that a program ended while it was letting this servo's joint down (--take-over); "" if it did not, if torque
-    is off by now, or if the settings are the original ones. Raises the errors of `Servo.read`.
+    """Return a message if a program ended while it was letting this servo's joint down (--take-over). Returns "" if no
+    program did, if torque is off by now, or if the settings are the original ones. Raises the errors of `Servo.read`.
     """
     if not (kept.was_held and servo.read("Torque Enable")):
         return ""

@@ -32,17 +32,17 @@ class SavedSettings:
     _say: Callable[[str], None]
     config: str = ""
     left: dict[Joint, Kept] = field(default_factory=dict)
-    """Saved settings of the servos that an earlier run did not restore."""
+    """Settings that an earlier run saved but did not restore, by servo."""
     kept: dict[Joint, Kept] = field(default_factory=dict)
-    """Saved settings of the servos that this session changes."""
+    """Saved settings of the servos whose settings this session changes."""
     wanted: dict[Joint, dict[str, int]] = field(default_factory=dict)
-    """Settings to restore: the saved ones, except for registers that another program has changed since a run was
-    killed.
+    """Settings to restore: the saved ones, but with the present values of registers that another program has changed
+    since a run was killed.
     """
     reduced: dict[Joint, dict[str, int]] = field(default_factory=dict)
-    """Goals restored only as far as a lowered limit allows, with the restored values."""
+    """Goals that could be restored only as far as a lowered limit allows, with the values that they now have."""
     undone: dict[tuple[Joint, str], tuple[int, int]] = field(default_factory=dict)
-    """Registers that held another program's value, with that value and the restored one."""
+    """Registers that another program had changed, each with that program's value and the restored value."""
     _refused: set[Joint] = field(default_factory=set)
     """Servos whose Current Limit another program has left too low for this run; the file keeps its former value."""
 
@@ -102,7 +102,7 @@ class SavedSettings:
     def _on_file(
         self, joint: Joint, settings: dict[str, int], changed: dict[str, int], since: str, *, was_held: bool = False
     ) -> Kept:
-        """Write a servo's file; if that fails, report the values, those that this program changes first."""
+        """Write a servo's file. If that fails, report the values that this program is about to change."""
         url, model = self.bus.port.url, joint.servo.name
         try:
             return settings_file.keep(url, joint.id, model, settings, changed, since, self.config, was_held=was_held)

@@ -1,8 +1,8 @@
 """A session with the arm's servos: their settings are saved before the first write and restored after the last.
 
 A session holds the port. A session inside another one for the same arm shares the port, so that the steps of a pilot
-write each EEPROM register only once. Each register is also restored only once, when the outermost block ends, for
-whatever reason. If a killed program left saved settings behind, these are taken as the servos' original settings and
+write each EEPROM register only once. Each register is also restored only once, when the outermost block ends, whatever
+the reason. If a killed program left saved settings behind, these are taken as the servos' original settings and
 restored at the end (`killed_run`).
 """
 
@@ -48,7 +48,7 @@ _MOST_CUTS = 5
 """Largest number of times that torque is cut again at the end if another program switches it on."""
 
 REBOOT_S = 0.6
-"""A servo that does not answer at the end may be booting; it is tried again after this time [s]."""
+"""A servo that does not answer at the end may be booting, so it is tried again after this time [s]."""
 
 COUNT_DOWN_S = 5.0
 """Time from the warning that the arm will move again, after a stopped run, until torque is switched on [s]."""
@@ -198,8 +198,8 @@ class ServoSession:
     def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
         """Cut torque where it is on and restore these servos' settings; return whether there was anything to do.
 
-        If torque has been switched on again before, it is watched for WATCH_S, because a single reading may come too
-        early.
+        If another program has already switched torque on again in this session, torque is watched for WATCH_S, because
+        a single reading may come too early.
 
         failed: receives the errors of the servos whose settings could not be restored.
         """
@@ -223,7 +223,9 @@ class ServoSession:
         return True
 
     def _switched_on_by_another(self) -> Iterator[str]:
-        """Name the servos on which another program switched torque on after it was cut, unless it is still on."""
+        """Name the servos on which another program switched torque on after it had been cut, unless torque is still on
+        there.
+        """
         on = [joint for joint, is_on in self._torque.items() if is_on]
         silent = [joint for joint in self._on_again if self._torque.get(joint, True) is None]
         if on or silent:

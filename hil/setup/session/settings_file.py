@@ -1,9 +1,9 @@
-"""The servos' settings before a program changed them, in files that outlive the program.
+"""Files that store the servos' settings before a program changes them, and that outlive the program.
 
-There is one file per servo in the user's state folder, named after port, ID and model. However a program ends, the next
-program on that port finds the file and restores the settings. If the adapter has a serial number, the file is named
-after the adapter instead of the port, whose name may later belong to another arm. Otherwise, the file is also found if
-the port goes by another name: that of a symbolic link or of the device itself.
+There is one file per servo in the user's state folder, named after port, ID and model. Even if a program is killed, the
+next program on that port finds the file and restores the settings. If the adapter has a serial number, the file is
+named after the adapter instead of the port, whose name may later belong to another arm. Otherwise, the file is also
+found if the port goes by another name: that of a symbolic link or of the device itself.
 """
 
 import json

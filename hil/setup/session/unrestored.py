@@ -75,7 +75,7 @@ def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
         yield (
             f"The settings of {and_list(map(str, half_down))} from before the arm was taken over are in "
             f"{_where([saved.left[joint].path for joint in half_down])}. The next start with --take-over restores "
-            "them; if the servos are switched off and on, `hil check` does so, too."
+            "them; if the servos are switched off and on, `hil check` restores them as well."
         )
     for why, joints in by_reason(waiting).items():
         paths = [saved.left[joint].path for joint in joints]
@@ -86,7 +86,9 @@ def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
 
 
 def _is_half_down(saved: SavedSettings, joint: Joint) -> bool:
-    """Whether a servo with torque on still has lowered goals; if it has not, its file is removed."""
+    """Whether a servo that was being let down still has its lowered goals with torque on, or its settings could not be
+    fully restored.
+    """
     kept = saved.left[joint]
     try:
         if half_let_down(kept, saved.bus.drives[joint]):
