@@ -73,7 +73,9 @@ def near_by_design(space: Space) -> Iterator[str]:
 
 
 def _same_direction(config: Config, joint: JointConfig) -> str:
-    """Return a warning if both servos of a joint have the same direction, which is rarely right; otherwise ""."""
+    """Return a warning if both servos of a joint have the same configured direction, which is rarely right; otherwise
+    "".
+    """
     if len(joint.ids) == 1 or len(set(joint.directions)) > 1:
         return ""
     (first, second), sign = joint.ids, joint.direction

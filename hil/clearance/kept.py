@@ -1,4 +1,4 @@
-"""An arm's capsules, stored next to the copy of its description because the meshes are not copied."""
+"""Store an arm's capsules next to the copy of its description, because the meshes are not copied."""
 
 import json
 from pathlib import Path

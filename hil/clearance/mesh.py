@@ -1,4 +1,4 @@
-"""Reads the vertices of an STL (binary or text) or OBJ mesh file, from which its bounding box follows."""
+"""Read the vertices of an STL (binary or text) or OBJ mesh file. They determine the bounding box of the mesh."""
 
 from pathlib import Path
 

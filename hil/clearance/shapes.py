@@ -161,8 +161,8 @@ def _of_geom(geom: Geom) -> list[tuple[Array, float]]:
 
 
 def _pieces(capsule: Capsule) -> list[Capsule]:
-    """Split a capsule, because the piece next to a joint is allowed to touch a link that the other pieces must not
-    touch.
+    """Split a capsule into short ones. The piece next to a joint may be allowed to touch a link that the other pieces
+    must not touch.
     """
     length = float(np.linalg.norm(capsule.ends[1] - capsule.ends[0]))
     if not length < np.inf:

@@ -24,18 +24,18 @@ design.
 
 NEAR_SHARE, NEAR_SHARE_OF_OTHERS = 0.75, 0.98
 """Two capsules that are closer than BUILT_NEAR in at least this fraction of random poses are near each other by design:
-they must not touch, but need no margin. The first value applies if there is one link between them, the second if there
-are more.
+they must not touch, but need no margin. The first value applies if exactly one link lies between them, the second if
+more do.
 """
 
 BUILT_NEAR = 0.02  # m beyond the margin
 TOUCHED = 0.02
-"""Capsules closer than this in the rest pose might support the arm there [m]."""
+"""Capsules that are closer than this in the rest pose [m] might support the arm there."""
 
 RANDOM_POSES = 400
 AT_REST_SLACK = 0.008
-"""If a pair is closer than the margin in the rest pose, it may come even closer, by up to this distance [m], on the way
-to or from that pose.
+"""If the members of a pair are closer than the margin in the rest pose, they may come closer still, by up to this
+distance [m], on the way to or from that pose.
 """
 
 AT_REST_INSIDE = 0.02

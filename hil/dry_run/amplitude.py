@@ -47,8 +47,8 @@ class AmplitudeOptions:
     polishing_ratio: float = 1.06
     """Factor by which each of the final increases raises a joint's torque."""
     worst_arms: int = 4
-    """After a failed check, the next check starts with the worst arms: as many as are allowed to exceed a limit, plus
-    this number.
+    """After a failed check, the next check starts with the worst arms. Their number is the number of arms that may
+    exceed a limit, plus this value.
     """
     back_off: float = 0.93
     """Factor by which the torque is multiplied when the check on all arms has failed."""
@@ -163,7 +163,7 @@ def _search(
     executor: Executor | None,
     options: AmplitudeOptions,
 ) -> Array:
-    """Approach the limits iteratively, since the joints are coupled; return peak torques (joints,) [N m]."""
+    """Approach the limits iteratively, since the joints are coupled. Return the peak torques (joints,) [N m]."""
     torque = base.segments[0].peak_torque
     first = base.first_segment() if ensemble.source == "prior" else base
 
@@ -214,14 +214,16 @@ def _polished(
 
 
 def _reached(config: Config, prediction: Prediction, share: float) -> Array:
-    """Fraction of its allowed range that each joint uses (joints,): the worst arm's or the predicted one, whichever is
-    larger.
+    """Fraction of its allowed range that each joint uses (joints,): that of the worst arm or the predicted one,
+    whichever is larger.
     """
     return np.asarray(prediction.shares_with(config.safety.limit_chance)[:GUARDED].max(axis=0) / share)
 
 
 def _too_many(config: Config, plan: Plan, few: Ensemble, share: float, pose: Array | None, count: int) -> bool:
-    """Whether more of the arms in `few` exceed `share` of a limit than are allowed among `count` arms."""
+    """Whether the number of arms in `few` that exceed `share` of a limit is larger than the number allowed among
+    `count` arms.
+    """
     if not few.size:
         return False
     passed = _passed(predict(config, plan, few, pose=pose), share)

@@ -1,4 +1,4 @@
-"""Check whether an unpowered arm has too little energy to exceed its position limits.
+"""Check whether an unpowered arm has too little energy to move beyond its position limits.
 
 An unpowered arm cannot reach a pose with more potential energy than its total energy. If every pose on the boundary of
 the permitted range has more potential energy than that, the arm's swing need not be simulated.
@@ -23,8 +23,8 @@ _MARGIN = 0.05
 class Boundary:
     """The position limits of an arm and the lowest potential energy at them.
 
-    low, high: limits (joints,) [rad]. least: lowest potential energy at the limits [J]; -inf if this model does not
-    bound the arm's energy.
+    low, high: limits (joints,) [rad]. least: lowest potential energy at the limits [J]; -inf if the model's parameters
+    do not bound the arm's energy.
     """
 
     physics: Physics

@@ -1,4 +1,5 @@
-"""Simulation of a spatial arm's experiment on an ensemble of possible arms: peaks versus limits, and clearance.
+"""Simulate a spatial arm's experiment on an ensemble of possible arms; compare the peaks with the limits, and find the
+clearance.
 
 Each arm follows every path in full: the transition from the rest pose, two periods, and the transition back.
 """
@@ -176,7 +177,9 @@ def _shares(values: Array, limits: Array, rest: Array, centre: Array) -> Array:
 
 
 def _nearest(space: Space, position: Array, ways: int, rate: float) -> tuple[Nearest, float]:
-    """Smallest clearance of a motion, and its time [s]. ways: samples of the transition at either end."""
+    """Smallest clearance of a motion, and the time at which it occurs [s]. ways: number of samples of the transition at
+    either end.
+    """
     every = max(1, round(rate / LOOKED_AT_HZ))
     count = position.shape[1]
     parts = (slice(0, ways, every), slice(ways, count - ways, every), slice(count - ways, count, every))

@@ -46,7 +46,7 @@ class Fall:
 
 @dataclass(frozen=True)
 class LoweringForeseen:
-    """Prediction of how the arm is lowered when it is stopped.
+    """Prediction of how a stopped arm is lowered: the worst of the simulated stops.
 
     seconds: longest duration [s]. nearest: smallest clearance. lies: fraction of simulations that end in the rest pose.
     joint: name of the joint that ends farthest from its rest angle, by `away` [rad]. helps: suggested remedy.

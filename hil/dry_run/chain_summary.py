@@ -24,9 +24,9 @@ class ChainDryRun:
 
     config: configuration with the path and stabiliser that would be used. share: fraction of the designed path's
     amplitude; 1 if [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of
-    links with parts that are closer than the margin in nearly every pose and thus not checked. refused: why the pilot
-    has no safe first step; "" if it has one, None without a pilot. The pilot's decision overrides the prediction.
-    on_stops: sentence that names the joints assumed to rest against their end stops; "" if there are none.
+    links with parts that are not checked, because they are closer than the margin in nearly every pose. refused: why
+    the pilot has no safe first step; "" if it has one; None if there is no pilot. The pilot's decision overrides the
+    prediction. on_stops: sentence that names the joints assumed to rest against their end stops; "" if there are none.
     """
 
     config: Config
@@ -82,7 +82,9 @@ def unsafe(config: Config, foreseen: ChainPrediction) -> str:
 
 
 def nearest_limit(peaks: Prediction) -> tuple[int, int]:
-    """Return the quantity (its index in QUANTITIES) and the joint whose limit the arms are most likely to reach."""
+    """Return the index of the quantity (in QUANTITIES) and of the joint whose limit the arms are most likely to
+    reach.
+    """
     touched = (peaks.shares[:, :GUARDED] >= 1.0).any(axis=0)
     chance = peaks.limit_chance[:GUARDED]
     row, joint = np.unravel_index(int(np.argmax(touched + chance)), chance.shape)

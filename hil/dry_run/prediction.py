@@ -34,7 +34,7 @@ follow from the other quantities.
 
 QUANTILE = 0.99
 _ARMS_A_TASK = 16
-"""Number of arms simulated by one task of an executor."""
+"""Number of arms that one task of an executor simulates."""
 _LEAST_SPREAD = 2e-3
 
 
@@ -82,8 +82,8 @@ class Prediction:
         return self._value_at(np.where(usual >= 1.0, usual, self.shares_with(chance)))
 
     def shares_with(self, chance: float) -> Array:
-        """Fractions of the limits (quantities, joints) that are exceeded with a total probability of `chance`, or those
-        of the worst arm where these are larger.
+        """Fractions of the limits (quantities, joints) that are exceeded with a total probability of `chance`; where
+        the worst arm reaches a larger fraction, that fraction.
         """
         foreseen = self.share_at(NormalDist().inv_cdf(1 - chance / (2 * GUARDED)))
         return np.asarray(np.maximum(foreseen, self.shares.max(axis=0)))
@@ -119,8 +119,8 @@ class Prediction:
         return origin
 
     def _middle(self) -> tuple[Array, Array]:
-        """Medians of the shares, and spreads above the medians (quantities, joints); peaks are skewed towards the
-        limit.
+        """Medians of the shares, and their spreads above the medians (quantities, joints). Only the upper half counts,
+        because the distribution of the peaks is skewed towards the limit.
         """
         middle = np.median(self.shares, axis=0)
         above = np.maximum(self.shares - middle, 0.0)

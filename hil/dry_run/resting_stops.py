@@ -23,18 +23,20 @@ NEAR_STOP_RAD = 0.14
 
 
 PASSED_RAD = 0.05
-"""A joint that has moved this far [rad] beyond its rest pose has no end stop there, since no end stop yields that much.
+"""If a joint has moved this far [rad] beyond its rest angle, it has no end stop there, since no end stop yields that
+much.
 """
 
 
 def resting_stops(config: Config, arms: ChainArms, planned: Sequence[Array] = (), passed: Mask | None = None) -> Array:
-    """The end stop against which each joint rests (joints,): -1 at its smallest angle, 1 at its largest, 0 for neither.
+    """The end stop against which each joint rests (joints,): -1 if at its smallest angle, 1 if at its largest, 0 if
+    neither.
 
     A joint is assumed to rest against an end stop if its rest pose is near the end of its range, nothing else touches
-    the part of the arm that it moves, and gravity does not pull it away from the stop. This is not assumed if a
-    recording or a planned path takes the joint beyond its rest pose, within its configured limits. planned: positions
-    of the planned paths, each (joints, samples) [rad]. passed: whether each joint has been below its rest pose (row 0)
-    and above it (row 1), as returned by `passed_rest`. Raises ArmFileError.
+    the part of the arm that it moves, and gravity does not pull it away from the stop. A joint that a recording or a
+    planned path takes beyond its rest angle is assumed to have no end stop there. planned: positions of the planned
+    paths, each (joints, samples) [rad]. passed: whether each joint has been below its rest pose (row 0) and above it
+    (row 1), as returned by `passed_rest`. Raises ArmFileError.
     """
     rest = np.array(config.arm.rest_pose)
     low, high = _ends(config, rest)

@@ -38,15 +38,15 @@ LONGEST_S = 1.5
 _ARMS = 16
 _THREADS = 2
 _AHEAD_S = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.2)
-"""Times over which position is extrapolated at constant velocity [s], to find the moments that lead to the largest
-overshoot.
+"""To find the moments that lead to the largest overshoot, the position is extrapolated at constant velocity over these
+times [s].
 """
 _EVENLY = 16
 _IMMOVABLE = 1e3  # kg m^2
 _JUDGED_AFTER_S = (0.05, 0.2, 0.5)
 """Times after torque is cut at which a simulation ends if the arm's energy is too low to exceed its limits [s]."""
 _REACTION = 2
-"""Number of samples before the stop takes effect: the sample that shows the fault, and the one in progress."""
+"""Number of samples until the stop takes effect: the sample that shows the fault, and the one in progress."""
 
 
 class Way(StrEnum):
@@ -89,7 +89,7 @@ _Piece = tuple[Array, Feedback, int]
 """Commanded torque (joints,) [N m], feedback added to it, and duration in samples."""
 
 _Commands = Callable[[_Start], Iterator[list[_Piece]]]
-"""Yields the commands that stop the arm from a given start: one list of pieces for each variant."""
+"""Yields the commands that stop the arm in a given initial state, as one list of pieces for each variant."""
 
 
 def stopping_distance(config: Config, plan: Plan, ensemble: Ensemble, velocity: Array) -> Stopping:
@@ -304,8 +304,8 @@ class _Stops:
         yield [(start.goal, self._none, _REACTION), (pushed, self._none, NOTICED_AFTER), self._off]
 
     def silent(self, start: _Start) -> Iterator[list[_Piece]]:
-        """Either all servos keep their goals until their watchdogs trip, or only one does and the others are cut
-        earlier.
+        """Either all servos keep their goals until their watchdogs trip, or only one servo does, and the torque of the
+        others is cut earlier.
         """
         kept = (start.goal, self._none, self._heard_for)
         yield [kept, self._off]

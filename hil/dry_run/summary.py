@@ -44,8 +44,8 @@ class DryRun:
 
     source: "prior" or "result". arms: number of simulated arms. asked: prediction for the configured
     experiment.peak_torque, None if not configured. largest: the largest safe torque with its prediction; None if no
-    torque is safe for all arms, in which case only a pilot can find one. servos: messages from reading the servos.
-    first: the first run of the pilot, None if the torque is configured.
+    torque is safe for all arms, in which case only a pilot can find a safe torque. servos: messages from reading the
+    servos. first: the first run of the pilot, None if the torque is configured.
     """
 
     source: str
@@ -67,7 +67,9 @@ class DryRun:
         return self.first.prediction
 
     def is_safe(self, config: Config) -> bool:
-        """Whether the configured torque is safe; if none is configured, whether a safe torque or first run exists."""
+        """Whether the configured torque is safe; if none is configured, whether there is a safe torque or a safe first
+        run.
+        """
         return self.asked is None or self.asked.stop_chance <= config.safety.limit_chance
 
 
@@ -235,7 +237,9 @@ def _list(values: Array, digits: int = 2) -> str:
 
 
 def _percent(chance: float) -> str:
-    """Format a probability as a percentage; "below 0.01 %" if it is too small to estimate from these arms."""
+    """Format a probability as a percentage. Positive values too small to be estimated from these arms become "below
+    0.01 %".
+    """
     if chance < 1e-8:
         return "0 %"
     return "below 0.01 %" if chance < 1e-4 else percent(chance)

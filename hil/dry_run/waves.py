@@ -1,4 +1,4 @@
-"""Choice of the waves for a full run: either multisines with a low crest factor that make good use of the position
+"""Choose the waves of a full run: either multisines that have a low crest factor and make good use of the position
 range, or optimally designed multisines.
 """
 
@@ -30,7 +30,9 @@ def roomy_plan(config: Config, physics: Physics) -> Plan:
 
 
 def roomy_plans(config: Config, physics: Physics, count: int) -> list[Plan]:
-    """Return up to `count` plans, best first: `roomy_plan` with different variants of the first multisine."""
+    """Return up to `count` plans, the best first. They differ from `roomy_plan` in the variant of the first
+    multisine.
+    """
     problem = design_problem(config, physics, ())
     plan = with_peaks(config, _torque_limits(config))
     first, *others = [_variants(config, problem, segment) for segment in plan.segments]
@@ -39,15 +41,17 @@ def roomy_plans(config: Config, physics: Physics, count: int) -> list[Plan]:
 
 
 def _variants(config: Config, problem: DesignProblem, segment: Segment) -> list[Segment]:
-    """Return the segment with each variant of its wave, the most even motion first."""
+    """Return a copy of the segment for each variant of its wave, ordered by `_evenness` of the motion, the highest
+    first.
+    """
     wave = problem.scaled(segment.multisine, np.ones(len(config.joints)))
     ordered = sorted(_turned(wave), key=lambda each: _evenness(problem, each), reverse=True)
     return [_with_wave(config, segment, each) for each in ordered]
 
 
 def _evenness(problem: DesignProblem, wave: Multisine) -> float:
-    """Range covered by the motion, as a fraction of the largest range within the limits, for the worse joint; 1 is
-    ideal.
+    """Range that the motion would cover if it were scaled to just reach a limit, as a fraction of the range between the
+    limits, for the worse joint; 1 is ideal.
     """
     ones = np.ones((1, wave.joints))
     arms = ManyArms([problem.physics], ones, problem.pose[None], problem.feedback)

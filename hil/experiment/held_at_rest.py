@@ -28,7 +28,7 @@ class HeldAtRest:
         self._allowed = OVERSHOOT * max(first) + AWAY_RAD
 
     def look(self, positions: Sequence[float]) -> tuple[int, str] | None:
-        """Return the index of a joint that is too far from its rest pose, with a message about it; None if no joint is."""
+        """Return the index of a joint that is too far from its rest pose, with a message; None if no joint is."""
         for index, (at, pose) in enumerate(zip(positions, self._pose, strict=True)):
             if abs(at - pose) > self._allowed:
                 return index, (

@@ -132,7 +132,9 @@ def run_experiment(
 
 @contextmanager
 def _with_torque(torque: str) -> Iterator[None]:
-    """Append the torque state to errors raised while the recording is closed, and to stop requests deferred until then."""
+    """Append the torque state to errors from closing the recording, and to stop requests that were deferred
+    until then.
+    """
     try:
         yield
     except (RunFolderError, StopRequested) as error:

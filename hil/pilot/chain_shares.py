@@ -233,7 +233,9 @@ class SafeShares:
         return found, why, shortage
 
     def _found(self, config: Config, share: float, which: str) -> tuple[Found | None, str, float]:
-        """Return this fraction if it is safe; otherwise, why it is not, and by how much its clearance is too small [m]."""
+        """Return this fraction if it is safe; otherwise, why it is not, and by how much the clearance is too
+        small [m].
+        """
         shortage = 0.0
         for count in (SEARCH_ARMS, ARMS):
             found, why, lacking = self._unsafe(config, share, count, which)

@@ -1,4 +1,4 @@
-"""Repeat runs that were stopped because this computer missed deadlines, since such stops reveal nothing about the arm."""
+"""Repeat runs that were stopped because this computer missed deadlines. Such stops reveal nothing about the arm."""
 
 from collections.abc import Callable
 

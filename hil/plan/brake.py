@@ -37,12 +37,14 @@ Some increase is normal: gravity and the other joint's brake act on the joint.
 """
 
 STILL_FASTER, SLOWS_AFTER_S = 0.06, 0.02
-"""Once it has lasted for the given time [s], braking is abandoned if the speed increases by this smaller fraction of
-the velocity limit. Otherwise, a reversed motor could drive a joint with a high velocity limit until braking ends.
+"""The first value replaces `GETS_FASTER` once braking has lasted for the second one [s]. Without it, a reversed motor
+could drive a joint that has a high velocity limit until braking ends.
 """
 
 NOTICED_AFTER = 2
-"""Number of samples for which a brake with the wrong sign acts before it is detected: one, plus the one in progress."""
+"""Number of samples for which a brake with the wrong sign acts before this is detected: one, plus the one in
+progress.
+"""
 
 
 def may_brake(config: Config, error: BaseException) -> bool:

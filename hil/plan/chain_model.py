@@ -14,8 +14,8 @@ from hil.estimator.chain.model.prior import Prior
 from hil.plan.drive_prior import armatures
 
 MOST_ARMATURE = 0.01
-"""Largest armature that the feed-forward assumes for a joint [kg m^2]. If too small an armature is assumed, the
-stabiliser supplies the rest; if too large a one is assumed, a light joint is thrown.
+"""Largest armature that the feed-forward assumes for a joint [kg m^2]. If the assumed armature is too small, the
+stabiliser supplies the missing torque; if it is too large, a light joint is thrown.
 """
 
 ROUGH_FRICTION = 0.02  # of a joint's largest torque, assumed by the feed-forward
@@ -62,7 +62,7 @@ def known_chain(config: Config) -> KnownChain:
 def torque_constant_stds(config: Config) -> Array:
     """Relative standard deviation of each joint's torque constant (joints,); all 0 if the configuration gives none.
 
-    If it gives only some of them, the typical value is used for the others.
+    If the configuration gives only some of them, the typical value is used for the other joints.
     """
     given = any(joint.torque_per_goal_std for joint in config.joints)
     return np.array([joint.torque_spread if given else 0.0 for joint in config.joints])

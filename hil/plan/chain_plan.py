@@ -58,7 +58,7 @@ class PathSegment(Segment):
 
 
 class NoHeadroom(ConfigError):
-    """A path requires too large a share of a joint's torque limit."""
+    """A path requires too much of a joint's available torque."""
 
 
 def plan_of(config: Config) -> Plan:
@@ -67,7 +67,7 @@ def plan_of(config: Config) -> Plan:
 
 
 def missing_path(config: Config) -> str:
-    """Return advice if [joint_path], which a spatial arm without a pilot needs, is missing; "" if it is given."""
+    """Return advice if [joint_path] is missing, which a spatial arm needs if there is no pilot; otherwise ""."""
     if config.joint_path is not None:
         return ""
     return (
@@ -203,7 +203,9 @@ def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
 
 
 def _ways(config: Config, path: Path) -> tuple[Path, Path]:
-    """Transitions from rest to motion along the path and back; each joint stays between its rest angle and the path."""
+    """Transitions from rest to the motion along the path, and back to rest. Each joint stays between its rest angle and
+    its angle on the path.
+    """
     count = max(2, round(config.experiment.ramp * config.experiment.rate))
     samples = path.position.shape[1]
     before, after = np.arange(-count, 0) % samples, np.arange(count) % samples
@@ -227,7 +229,7 @@ def _blended(config: Config, path: Path, at: NDArray[np.int64], s: Array, second
 
 
 def _fade(count: int, rate: float) -> Array:
-    """Smooth rise from 0 to 1 over SETTLE_IN, then 1."""
+    """A factor that rises smoothly from 0 to 1 within SETTLE_IN and then stays at 1."""
     s = np.clip(np.arange(max(2, count)) / (SETTLE_IN * rate), 0.0, 1.0)
     fade: Array = s * s * (3.0 - 2.0 * s)
     return fade

@@ -28,16 +28,16 @@ def chain_too_slow(config: Config) -> str:
     wanted = loop.sufficient_rate(rate, _HIGHEST_HZ)
     raised = "" if wanted is None else f"Raise the rate to at least {ceil(wanted)} Hz, or lower"
     return (
-        f"experiment.rate = {rate:g} is too low for the stabiliser: each torque follows from a state read "
-        f"{1e3 / rate:.0f} ms before and is held for as long. With a stiffness of {config.stabiliser.stiffness[at]:g} "
-        f"N m/rad and a damping of {config.stabiliser.damping[at]:g} N m s/rad, joint {config.joints[at].name!r} "
-        f"may oscillate more and more: the arm may be lighter than described, with less friction. {raised or 'Lower'} "
-        "stabiliser.stiffness and stabiliser.damping."
+        f"experiment.rate = {rate:g} is too low for the stabiliser: each torque is based on a state that was read "
+        f"{1e3 / rate:.0f} ms earlier, and is then held for the same time. With a stiffness of "
+        f"{config.stabiliser.stiffness[at]:g} N m/rad and a damping of {config.stabiliser.damping[at]:g} N m s/rad, "
+        f"joint {config.joints[at].name!r} may oscillate more and more if the arm is lighter than described and has "
+        f"less friction than expected. {raised or 'Lower'} stabiliser.stiffness and stabiliser.damping."
     )
 
 
 def sampled_loop(config: Config) -> SampledLoop:
-    """The held joints of an arm that is one standard deviation lighter, and has one less friction, than expected."""
+    """The control loop of an arm whose masses and friction are one standard deviation below their expected values."""
     assert config.stabiliser is not None
     known, given = known_chain(config), config.arm.prior or PriorConfig()
     links = Guess(1.0, given.spread).low * known.described.reshape(-1, TERMS)[:, :-1]
@@ -51,7 +51,9 @@ def sampled_loop(config: Config) -> SampledLoop:
 
 
 def _poses(config: Config) -> Array:
-    """Poses between the rest pose and the path (poses, joints) [rad]; if the path is not known yet, within limits."""
+    """Poses between the rest pose and the path (poses, joints) [rad] or, if the path is not known yet, poses within the
+    position limits.
+    """
     rest, path = np.array(config.arm.rest_pose), config.joint_path
     if path is None:
         low, high = np.array([joint.position_limit for joint in config.joints]).T

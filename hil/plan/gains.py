@@ -18,7 +18,7 @@ def most_damping(rate: float, lightest: Array) -> Array:
 
 
 def most_stiffness(rate: float, damping: Array, friction: Array) -> Array:
-    """Largest stiffness of each joint [N m/rad] at a rate [Hz]. damping: gain of the damper. friction: viscous friction
-    of the joint itself. Both (joints,) [N m s/rad].
+    """Largest stiffness of each joint [N m/rad] at a rate [Hz]. damping: gain of the damper (joints,) [N m s/rad].
+    friction: viscous friction of the joint itself (joints,) [N m s/rad].
     """
     return MOST_DRIVING * rate / DELAY_SAMPLES * (damping + friction)

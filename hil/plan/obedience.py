@@ -15,8 +15,8 @@ from typing import NamedTuple
 __all__ = ["Obedience", "Residual"]
 
 SUSPECT = 0.5, 5.0
-"""Range of the ratio of unexplained to commanded torque that may indicate a reversed motor. Ideally the ratio is 2; it
-is smaller just after the motor has become reversed, and larger if the commanded torque has just changed.
+"""The motor may be reversed if the ratio of unexplained to commanded torque is in this range. Ideally, the ratio is 2;
+it is smaller just after the motor has become reversed, and larger if the commanded torque has just changed.
 """
 
 ENOUGH = 0.45
@@ -25,9 +25,10 @@ ENOUGH = 0.45
 LONGEST_TEST_S = 0.06
 
 TURNED, PUSHED = 1.1, 0.7
-"""Drop in the unexplained torque, relative to the drop in the joint's own torque, when the joint's goal is removed: 2
-for a reversed motor (less right after the reversal), 1 for a motor without torque, 0 for a push. Above the first limit,
-the motor counts as reversed; up to the second, the joint counts as pushed; in between, it is tested again.
+"""Limits on the drop in the unexplained torque when the joint's goal is removed, relative to the drop in the joint's
+own torque. This ratio is 2 for a reversed motor (less right after the reversal), 1 for a motor without torque, and 0
+for a push. Above the first limit, the motor counts as reversed; up to the second, the joint counts as pushed; in
+between, the joint is tested again.
 """
 
 MOST_TURNED = 3.0
@@ -39,8 +40,8 @@ total drop; a larger deviation shows that the unexplained torque has another cau
 """
 
 MOST_UNEVEN = 3
-"""After this many consecutive tests in which the unexplained torque falls unevenly, it is nevertheless attributed to
-the motor.
+"""If the unexplained torque falls unevenly in this many consecutive tests, it is nevertheless attributed to the
+motor.
 """
 
 MOVES_RAD_S = 0.1
@@ -54,7 +55,7 @@ PAUSE_S, PUSHED_PAUSE_S = 0.01, 0.25
 
 
 class Residual(NamedTuple):
-    """Torque that the model does not explain, by joint (joints,).
+    """How far the model explains the torque of each joint (joints,).
 
     lacking: commanded torque minus the torque that explains the motion [N m]. torque: commanded torque [N m], filtered
     in the same way.

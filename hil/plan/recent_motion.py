@@ -31,7 +31,7 @@ _STEPS = 2.0
 """Uncertainty of a change of position, in encoder steps."""
 
 _MORE = 1.25
-"""Tolerance for a velocity that increases within the span, as a multiple of the mean velocity."""
+"""Factor applied to the mean velocity over a span, to allow for a velocity that increases within it."""
 
 CONTRADICTS = 2.0
 """A velocity contradicts the position if it is beyond this multiple of the range that the position allows: at constant
@@ -39,7 +39,7 @@ acceleration from standstill, the final velocity is twice the mean.
 """
 
 UNREACHABLE = 3.0
-"""Velocity that no servo reaches, relative to its no-load speed at its highest published voltage."""
+"""Lowest velocity that no servo can reach, relative to the servo's no-load speed at its highest published voltage."""
 
 
 class Travel(NamedTuple):
@@ -128,7 +128,7 @@ class RecentMotion:
         return abs(last.velocity[joint]) * seconds > self._steps[joint]
 
     def is_unreachable(self, joint: int, velocity: float) -> bool:
-        """Whether this is faster than any servo of this model can turn."""
+        """Whether this velocity [rad/s] is higher than any servo of the joint's model can reach."""
         return abs(velocity) > self._fastest[joint]
 
     def travels(self, joint: int) -> list[Travel]:

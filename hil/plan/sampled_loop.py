@@ -1,7 +1,7 @@
 """Stability of joints that are held by a sampled spring and damper, by linear analysis about given poses.
 
 Each torque follows from the sample before it and acts through the drive's lag for one sample. Gravity and dry friction
-are left out: the feed-forward compensates the one, and the other only damps.
+are left out: the feed-forward compensates for gravity, and dry friction can only damp the motion.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,9 @@ import numpy as np
 from hil.estimator.arrays import Array
 
 STABLE = 1.0 + 1e-6
-"""Largest growth per sample of a joint that does not oscillate: 1, for a joint without a spring, and rounding."""
+"""Largest growth per sample at which a loop counts as stable: 1, the growth of a joint without a spring, plus a
+tolerance for rounding errors.
+"""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class SampledLoop:
         return self.growth(rate) <= STABLE
 
     def fastest_growing(self, rate: float) -> int:
-        """The joint that moves with most kinetic energy in the motion that grows fastest at a rate [Hz]."""
+        """The joint that has the most kinetic energy in the fastest-growing motion at a rate [Hz]."""
         n = len(self.stiffness)
         values, vectors = np.linalg.eig(self._step(rate))
         pose, mode = np.unravel_index(np.argmax(np.abs(values)), values.shape)
@@ -45,8 +47,8 @@ class SampledLoop:
         return int(np.argmax(np.diagonal(self.mass[pose]) * velocity**2))
 
     def sufficient_rate(self, rate: float, highest: float) -> float | None:
-        """Rate [Hz] above `rate`, at which the loop is unstable, from which on it is stable; None if even `highest` is
-        too low.
+        """Find a rate [Hz] above which the loop is stable, given that it is unstable at `rate`; None if even `highest`
+        is too low.
         """
         low, high = rate, 1.5 * rate
         while not self.is_stable(high):

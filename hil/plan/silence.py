@@ -26,7 +26,7 @@ the bus, even one for another servo.
 
 
 class Limit(NamedTuple):
-    """A time limit [s], and a text that names the setting it comes from."""
+    """A time limit [s], and a text that names its source, such as a setting."""
 
     seconds: float
     said: str
@@ -53,7 +53,7 @@ def bridged_alone_limit(config: Config) -> Limit:
 
 
 def late_limit(config: Config) -> Limit:
-    """For how long consecutive deadlines may be missed."""
+    """How long the program may go on missing consecutive deadlines."""
     safety = config.safety
     if safety.max_late is not None:
         chosen = Limit((safety.max_late + 0.5) / config.experiment.rate, f"safety.max_late = {safety.max_late}")

@@ -92,9 +92,9 @@ def too_slow(config: Config) -> str:
     """Explain why the rate is too low for the stabiliser, and what to do; "" if it is high enough.
 
     A spring whose torque is delayed by `delay` acts like negative damping of magnitude stiffness times `delay`. The
-    joint oscillates unless the configured damping and the least viscous friction to be expected of its servos together
-    outweigh it. The damper is delayed too, and the joints are coupled: some of the damping is left for both. For a
-    spatial arm, whose masses are described, the loop itself is analysed.
+    joint oscillates unless this is outweighed by the configured damping together with the smallest viscous friction to
+    be expected of its servos. Part of the damping must remain, because the damper is delayed too and the joints are
+    coupled. For a spatial arm, whose masses are known from its description, the control loop itself is analysed.
     """
     if config.stabiliser is None:
         return ""

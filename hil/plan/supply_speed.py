@@ -30,7 +30,7 @@ def slower(config: Config, speed: list[float]) -> Config:
 
 
 def lowered(before: Config, after: Config) -> tuple[str, ...]:
-    """One sentence that names the joints whose velocity_limit was lowered; empty if there are none."""
+    """A tuple with one sentence that names the joints whose velocity_limit was lowered; empty if there are none."""
     pairs = zip(before.joints, after.joints, strict=True)
     now = [f"{new.name} {new.velocity_limit:g}" for old, new in pairs if old.velocity_limit != new.velocity_limit]
     if not now:

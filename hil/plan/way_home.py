@@ -1,5 +1,5 @@
-"""Path along which a stopped spatial arm is lowered: from any pose to the rest pose, clear of obstacles, in bounded
-time.
+"""Path along which a stopped spatial arm is lowered. It leads from any pose to the rest pose, clear of obstacles and in
+bounded time.
 
 The path is straight in joint space if a straight path is clear. Otherwise it leads straight to the first reachable pose
 of the planned transition from the rest pose, and then back along that transition, which is known to be clear.
@@ -18,8 +18,8 @@ STATIONS = 16
 """Number of poses of the planned transition at which an arm may join it."""
 
 PULL_PER_S, PULL_SHARE = 2.0, 0.25
-"""Growth rate of the additional torque that pulls a joint to the path, relative to the spring's torque [1/s], and its
-upper limit, relative to the joint's largest torque.
+"""An additional torque pulls a joint to the path. The first value is its growth rate, relative to the spring's torque
+[1/s]; the second is its upper limit, relative to the joint's largest torque.
 
 At a low sampling rate the spring alone is too weak to overcome the friction of a light joint.
 """
@@ -111,6 +111,6 @@ def _line(first: Array, last: Array) -> Array:
 
 
 def _lengths(corners: Array) -> Array:
-    """Travel between successive corners (corners - 1,) [rad], of the joint that moves most."""
+    """Displacement of the joint that moves most between successive corners (corners - 1,) [rad]."""
     lengths: Array = np.abs(np.diff(corners, axis=1)).max(axis=0)
     return lengths

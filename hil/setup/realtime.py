@@ -52,7 +52,7 @@ def real_time() -> Iterator[list[Granted]]:
 
 @contextmanager
 def on_time(clock: Clock) -> Iterator[list[Granted]]:
-    """With a wall clock, act as `real_time` does. With a virtual clock, nothing can be late, so nothing is requested."""
+    """With a wall clock, act as `real_time` does. With a virtual clock, nothing is requested: nothing can be late."""
     if isinstance(clock, WallClock):
         with real_time() as granted:
             yield granted

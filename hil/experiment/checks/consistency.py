@@ -342,7 +342,7 @@ def _forget_sums(memory: Any) -> None:
 
 
 def _learn(memory: Any) -> None:
-    """From now on, accept a multiple of the estimated lag and scale error instead of the largest values of any servo."""
+    """From now on, accept a multiple of the estimated lag and scale error, not the largest values of any servo."""
     lags = memory.lags
     memory.learnt = lags.information
     memory.lag = min(LAG_S, 2.0 * max(lags.lag, 0.0) + MORE_LAG_S + STDS * lags.lag_std)
