@@ -173,7 +173,9 @@ def _pieces(capsule: Capsule) -> list[Capsule]:
 
 
 def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Capsule], list[str]]:
-    """Return capsules around everything fixed to one moving link, and why any shapes could not be read."""
+    """Return capsules around everything fixed to one moving link, and a sentence for each shape that could not
+    be used.
+    """
     found, unread = [], []
     for _, rotation, translation, element in here:
         if element is None:

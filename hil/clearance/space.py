@@ -276,7 +276,8 @@ def _by_design(
 ) -> tuple[Mask, Array]:
     """Whether the capsules of each pair (pairs,) are closer than the margin in nearly every pose within the limits.
 
-    Also returns the median distance of pairs that are near each other in most poses (pairs,) [m]; infinite for others.
+    Also returns the median distance of each pair (pairs,) [m] if its members are near each other in most poses;
+    infinite for other pairs.
     """
     link = arrays[0]
     low, high = np.array([joint.position_limit for joint in config.joints]).T

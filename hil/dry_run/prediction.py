@@ -82,8 +82,8 @@ class Prediction:
         return self._value_at(np.where(usual >= 1.0, usual, self.shares_with(chance)))
 
     def shares_with(self, chance: float) -> Array:
-        """Fractions of the limits (quantities, joints) that are exceeded with a total probability of `chance`; where
-        the worst arm reaches a larger fraction, that fraction.
+        """Fractions of the limits (quantities, joints) that are exceeded with a total probability of `chance` or, if
+        larger, the fractions that the worst arm reaches.
         """
         foreseen = self.share_at(NormalDist().inv_cdf(1 - chance / (2 * GUARDED)))
         return np.asarray(np.maximum(foreseen, self.shares.max(axis=0)))

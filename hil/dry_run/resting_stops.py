@@ -76,7 +76,7 @@ def said_of_stops(config: Config, side: Array) -> str:
     return (
         "Nothing in the description supports these joints in the rest pose, so each is assumed to rest against its "
         f"own end stop: {', '.join(found)}. If something else supports them, name it in [clearance] (floor, "
-        "boxes). Otherwise they may sag by up to the angle in brackets before position_limit stops the arm."
+        "boxes). A joint that nothing holds may sag by up to the angle in brackets before position_limit stops the arm."
     )
 
 

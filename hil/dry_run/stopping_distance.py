@@ -44,7 +44,9 @@ times [s].
 _EVENLY = 16
 _IMMOVABLE = 1e3  # kg m^2
 _JUDGED_AFTER_S = (0.05, 0.2, 0.5)
-"""Times after torque is cut at which a simulation ends if the arm's energy is too low to exceed its limits [s]."""
+"""Times after torque is cut [s] at which a simulation ends if the arm no longer has enough energy to exceed its
+limits.
+"""
 _REACTION = 2
 """Number of samples until the stop takes effect: the sample that shows the fault, and the one in progress."""
 
@@ -159,8 +161,8 @@ def _planned_goals(config: Config, plan: Plan) -> Array:
 
 
 def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array) -> list[_Start]:
-    """States of the planned motion before it reaches a limit: some are evenly spaced, and others are likely to
-    overshoot most.
+    """States of the planned motion before it reaches a limit. Some are evenly spaced in time; the others are those from
+    which the arm is likely to overshoot most.
     """
     rest = resting(np.array(config.arm.rest_pose))
     moved = respond(physics, rest, goals * scale[:, None], config.experiment.rate, _felt(config, scale), COARSE)

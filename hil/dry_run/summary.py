@@ -25,7 +25,7 @@ class FirstRun:
 
     peak_torque: peak torques (joints,) [N m]. prediction: peaks of the simulated arms, with the limits of that run.
     played: configuration of that run. It contains the proposed stabiliser if the arm needs one; if no torque is safe
-    over the whole range, its position limits are closer to the rest pose.
+    over the whole range, it has position limits closer to the rest pose.
     """
 
     peak_torque: Array

@@ -36,11 +36,11 @@ class Deadlines:
         self._often = 0.0
         self._heard_instead = heard_instead
         self._counted = self._waited = 0
-        """Missed deadlines that `_often` counts, and how many of them were missed while waiting for a reply that never
-        came.
+        """Number of missed deadlines that `_often` reflects, and how many of these were missed while this program
+        waited for a reply that never came.
         """
         self.any_missed = False
-        """Whether there are missed deadlines that deadlines met since then have not yet offset."""
+        """Whether a deadline was missed and too few have been met since then to offset this."""
 
     def missed(self, seconds: float = 0.0, *, waited: bool = False) -> None:
         """Record a missed deadline, `seconds` after the last command.

@@ -220,8 +220,8 @@ class StatusCheck:
         return self._heard_instead() or refused
 
     def _never_sent(self, joint: int, held: float) -> bool:
-        """Whether the goal that a servo holds differs from every goal sent to any joint since its latest status that
-        matched.
+        """Whether the goal that a servo holds differs from every goal sent to any joint since the servo's latest
+        matching status.
 
         The halves of a two-servo joint's goal may differ in age, so nothing is known about their sum.
         """

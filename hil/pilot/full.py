@@ -120,8 +120,8 @@ def _faster(config: Config, options: PilotOptions) -> list[float]:
 
 
 def _tolerant(config: Config, most: float) -> Config:
-    """The configuration with other multisines and a permitted difference between successive periods that is twice as
-    large, but at most `most`.
+    """The configuration with other multisines. The permitted difference between successive periods is doubled, up to
+    `most`.
     """
     experiment = config.experiment
     within = min(2.0 * experiment.settle_within, max(experiment.settle_within, most))

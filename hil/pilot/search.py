@@ -61,7 +61,7 @@ class Search:
     """Range of motion of each joint in the earlier run from which the belief comes (joints,) [rad], if known."""
 
     fast: Mask = field(init=False)
-    """Joints that exceeded their velocity limit in the last run before moving by MOVED_STEPS (joints,)."""
+    """Which joints (joints,), in the last run, exceeded their velocity limit before they had moved by MOVED_STEPS."""
     calm: Array = field(init=False)
     """Cap on the torque (joints,) [N m]: below the torque of every run in which a joint exceeded its velocity limit
     before moving by MOVED_STEPS; infinite if there was no such run.

@@ -19,9 +19,9 @@ switching it off takes some time.
 """
 
 BRIDGED_ALONE_S = 0.028
-"""How long servos may fail to reply while an arm is being lowered and another servo replies [s]. The silent servo's ID
-may have changed: then only its Bus Watchdog can stop it, and the watchdog's timeout starts anew with every packet on
-the bus, even one for another servo.
+"""How long servos may fail to reply while an arm is being lowered and another servo replies [s]. If the silent servo's
+ID has changed, only its Bus Watchdog can stop it, and the watchdog's timeout starts anew with every packet on the bus,
+even one for another servo.
 """
 
 

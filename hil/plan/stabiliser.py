@@ -111,9 +111,10 @@ def too_slow(config: Config) -> str:
         f"experiment.rate = {config.experiment.rate:g} is too low for the stabiliser of joint "
         f"{config.joints[worst].name!r}: its torque is based on a state {1e3 * delay:.0f} ms old. A stiffness of "
         f"{stiffness[worst]:g} N m/rad then acts like a damping of -{delay * stiffness[worst]:.2g} N m s/rad, but the "
-        f"stabiliser and friction together provide only {damps[worst]:.2g}, of which at most {100 * MOST_DRIVEN:.0f} % "
-        f"may be cancelled. Raise the rate to at least {ceil(config.experiment.rate * shares[worst] / MOST_DRIVEN)} "
-        "Hz, lower stabiliser.stiffness, or raise stabiliser.damping."
+        f"stabiliser and friction together provide a damping of only {damps[worst]:.2g}, of which at most "
+        f"{100 * MOST_DRIVEN:.0f} % may be cancelled. Raise the rate to at least "
+        f"{ceil(config.experiment.rate * shares[worst] / MOST_DRIVEN)} Hz, lower stabiliser.stiffness, or raise "
+        "stabiliser.damping."
     )
 
 

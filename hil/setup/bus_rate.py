@@ -200,7 +200,7 @@ def goals_taken(bus: ServoBus) -> list[Joint]:
 
 
 def _give_back(bus: ServoBus, goals: Sequence[int]) -> None:
-    """Try to restore the goals of all servos; if any of them failed, then raise the first DriverError."""
+    """Try to restore the goals of all servos, then raise the first DriverError, if there was one."""
     failures: list[DriverError] = []
     for (drive, servo), goal in zip(bus.drives.items(), goals, strict=True):
         try:

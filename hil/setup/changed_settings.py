@@ -18,8 +18,8 @@ _GOAL_PWM = "Goal PWM"
 """Register that limits the voltage in current mode. A value of 0 proves nothing if the watchdog has tripped."""
 
 _BESIDE = frozenset({*PROTECTIVE, STATUS_LEVEL}) - {SECONDARY_ID}
-"""Settings that are named only along with others. They cannot explain why a run was stopped, except that a Status
-Return Level of 0 can.
+"""Settings that are named only along with others, since changes to them cannot explain why a run was stopped. The
+exception is a Status Return Level of 0.
 """
 
 _REGISTERS = (

@@ -25,8 +25,8 @@ NEAR_RAD = 0.02
 """Largest deviation from arm.rest_pose at which it is still used as the rest pose [rad]."""
 
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
-"""Motion after torque is cut is reported only if it exceeds the first value and if the arm was within the second value
-of its rest pose [rad].
+"""After torque is cut, a joint's motion is reported if it exceeds the first value [rad]. No motion is reported if,
+before that, any joint was farther than the second value [rad] from its rest angle.
 """
 
 _LONGEST_SAG_S = 3.0  # longest wait for an arm that moves after torque is cut

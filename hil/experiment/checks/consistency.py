@@ -103,10 +103,10 @@ used has only four samples per period and needs 0.27.
 """
 
 ROUGH_TIMES = 2.0
-"""Allowance of the slow memory for a velocity that jumps between samples, as when gears cross their backlash: a
-multiple of the root sum of squares of `CURVED` times the interval times the difference between successive velocity
-changes. A jump within an interval causes an RMS error of 0.29 times the jump times the interval, and appears in two of
-these differences.
+"""Allowance of the slow memory for a velocity that jumps between samples, as when gears cross their backlash. An error
+is estimated for each sample: `CURVED` times the interval times the difference between successive velocity changes. The
+allowance is this multiple of the root sum of squares of these errors. A jump within an interval causes an RMS error of
+0.29 times the jump times the interval, and appears in two of the differences.
 """
 
 CURVED_AT_FIRST = 0.3

@@ -23,7 +23,9 @@ FEWEST_READINGS, MOST_READINGS = 8, 256
 """Number of readings from which noise is first measured, and number of latest readings that are kept."""
 
 _UNCERTAIN = 1.9
-"""Largest amount by which n readings underestimate the noise, as a multiple of the true noise divided by sqrt(n)."""
+"""Largest amount by which n readings may underestimate the noise, as a multiple of the true noise divided by
+sqrt(n).
+"""
 
 _MAD_TO_SIGMA = 1.4826
 """Ratio of the standard deviation to the median absolute deviation for a normal distribution."""
@@ -59,7 +61,7 @@ class CurrentNoise:
         return FEWEST_READINGS <= count < MOST_READINGS and count & (count - 1) == 0
 
     def measured(self) -> tuple[list[float], list[float]]:
-        """Return each joint's noise and its upper bound [A or V]; 0 if there are too few readings."""
+        """Return each joint's noise and its upper bound [A or V]; both are 0 if there are too few readings."""
         if len(self._errors) < FEWEST_READINGS:
             return [0.0] * len(self._ticks), [0.0] * len(self._ticks)
         errors = np.array(self._errors)

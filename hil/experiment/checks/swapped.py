@@ -47,7 +47,7 @@ class SwappedReplies:
 
     def look(self, joint: int, now: State, before: Sequence[State | None]) -> tuple[int, int] | None:
         """Return the IDs of two servos that have exchanged positions, beginning with the one of this joint; None if
-        none of its servos has.
+        there are no such servos.
 
         now: the latest exchange. before: for each joint, the previous exchange that it answered, or None.
         """

@@ -232,9 +232,9 @@ class Lowering:
             turned = self._obedience.look(self._watch.residual, velocity.tolist(), now)
         if turned >= 0:
             raise SafetyStop(
-                f"{self._config.joints[turned].joint.title} is moving against its command: torque that the "
-                "model could not explain vanished when the joint's goal was removed for a moment. Its motor turns the "
-                "wrong way: check its direction and wiring, and whether another program has changed its Drive Mode.",
+                f"{self._config.joints[turned].joint.title} is moving against its command: when the joint's goal was "
+                "removed for a moment, the torque that the model could not explain vanished. Its motor turns the wrong "
+                "way: check its direction and wiring, and whether another program has changed its Drive Mode.",
                 Cause.WRONG_SIGN,
             )
         excess = velocity - self._velocity[index]

@@ -66,8 +66,8 @@ def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
 
 @contextmanager
 def telling_of_torque(bus: ServoBus) -> Iterator[None]:
-    """Add a note about torque to any exception that ends the block, unless it already has one: the session may also be
-    stopped between two runs. A DriverError is also marked if this program had switched torque on.
+    """Add a note about torque to any exception that ends the block, unless it already has one. An exception has none if
+    the session is stopped between two runs. A DriverError is also marked if this program had switched torque on.
     """
     try:
         yield

@@ -100,7 +100,7 @@ def is_left_on(servo: Servo, kept: Kept) -> bool:
     """Return whether the killed program left this servo's torque on. Raises the errors of `Servo.read`.
 
     If torque is on in a mode other than that program's, another program has switched it on since. Torque that was
-    already on when the killed program took the arm over does not count as left on by it.
+    already on when the killed program took the arm over was not left on by that program.
     """
     if kept.was_held:
         return False

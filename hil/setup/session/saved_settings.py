@@ -80,7 +80,7 @@ class SavedSettings:
             self._keep(joint, left.wanted, changed)
 
     def save_held(self, joints: Iterable[Joint]) -> Originals:
-        """Write the settings of servos that are about to be let down to disk, and return them.
+        """Save to disk the settings of servos that are about to be let down, and return these settings.
 
         If an earlier program began to let them down, its file holds the original goals. Raises the errors of
         `Servo.read`.

@@ -86,8 +86,8 @@ def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
 
 
 def _is_half_down(saved: SavedSettings, joint: Joint) -> bool:
-    """Whether a servo that was being let down still has its lowered goals with torque on, or its settings could not be
-    fully restored.
+    """Whether a servo that was being let down still has its lowered goals, with torque on, or could not be fully
+    restored.
     """
     kept = saved.left[joint]
     try:
