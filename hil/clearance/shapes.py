@@ -303,6 +303,6 @@ def _origin(element: ET.Element) -> tuple[Array, Array]:
 
 
 def _numbers(text: str | None, count: int, default: float = float("nan")) -> list[float]:
-    """Parse `count` numbers. Without text, all are `default`; if the text holds more or fewer, all are NaN."""
+    """Parse `count` numbers. Without text, all are `default`; if the text holds more or fewer numbers, all are NaN."""
     found = [default] * count if text is None else [float(word) for word in text.split()]
     return found if len(found) == count else [float("nan")] * count

@@ -152,7 +152,9 @@ def _farthest(
 
 
 def _planned_goals(config: Config, plan: Plan) -> Array:
-    """Commanded torque of the whole plan (joints, samples) [N m]; further identical periods would add nothing."""
+    """Commanded torque of the whole plan (joints, samples) [N m]. Each segment has only two periods, since more would
+    add nothing.
+    """
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     parts = []
     for segment in plan.segments:

@@ -51,7 +51,7 @@ _DOUBTS = (
     "The arm may not be the one described: the direction, zero_ticks or axis of this joint or of another one, or "
     "arm.base, may be wrong. Move the joints by hand, with torque off, to find out."
 )
-_AGAINST_STOP = " A motor whose direction is wrong may press the joint against the end stop on which it rests."
+_AGAINST_STOP = " With a wrong direction, its motor may press the joint against the end stop on which it rests."
 
 
 class ChainWatch:

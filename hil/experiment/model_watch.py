@@ -61,7 +61,7 @@ _USUAL_HZ = 0.7
 _FLAT = 0.3
 """Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the units of `_INERTIA`."""
 _NEAR_LIMIT = 0.05
-"""Distance from a position limit, as a fraction of the range, within which a hard stop is named as a possible cause."""
+"""Distance from a position limit, as a fraction of the range, within which an end stop is named as a possible cause."""
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
 """If a torque is held over several exchanges, a joint must appear stationary for this time [s] before it is checked."""
@@ -366,12 +366,12 @@ class ModelWatch:
         raise SafetyStop(said + self._near_limit(joint, state.position[joint]), Cause.UNEXPECTED)
 
     def _near_limit(self, joint: int, angle: float) -> str:
-        """Return a sentence if a joint may have hit a hard stop; "" if it is far from its position limits."""
+        """Return a sentence if a joint may have hit an end stop; "" if it is far from its position limits."""
         low, high = self._limits[joint]
         limit = low if angle - low < high - angle else high
         if abs(angle - limit) > _NEAR_LIMIT * (high - low):
             return ""
-        return f" It is at {angle:.2f} rad, close to its limit of {limit:g} rad: it may have hit a hard stop there."
+        return f" It is at {angle:.2f} rad, close to its limit of {limit:g} rad: it may have hit an end stop there."
 
 
 def standing_for(states: Iterable[State], joint: int) -> float:

@@ -121,7 +121,7 @@ class Repetition:
 
 
 def _rms_change(sums: Any) -> float:
-    """RMS difference from the previous period, except at the end [rad]; infinite if there was none."""
+    """RMS difference from the previous period, except at the end [rad]; infinite if there is no previous period."""
     return sqrt(sums["sure_squared"] / sums["sure_pairs"]) if sums["sure_pairs"] else inf
 
 

@@ -188,8 +188,8 @@ class StatusCheck:
         if self._is_foreign[joint] or is_repeated:
             return Cause.GOALS_LOST, (
                 f"does not hold the goals of this program: {held}, and it has held goals that this program never sent. "
-                "Either another program or controller is commanding it (stop or unplug that one), or goals are being "
-                "corrupted on the bus (check the adapter and the cable)."
+                "Either another program or controller is commanding it (stop that program or unplug that controller), "
+                "or goals are being corrupted on the bus (check the adapter and the cable)."
             )
         return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {self.why_lost()}"
 

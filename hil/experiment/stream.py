@@ -1,7 +1,7 @@
 """The real-time loop: one exchange, one guard check and one recorded sample per tick.
 
-If ticks are far apart, the exchange is repeated in between with the same goals, without recording. Every check thus
-sees an exchange at least every `hil.drivers.bus.CHECK_S`, whatever the rate of the experiment.
+If ticks are far apart, the exchange is repeated in between with the same goals, without being recorded. Every check
+thus sees an exchange at least every `hil.drivers.bus.CHECK_S`, whatever the rate of the experiment.
 
 The sequence is: rest; for each multisine a ramp in, the warm-up (only before the first), periods until two successive
 ones match, the remaining periods to be recorded, and a ramp out; then no current until the arm is at rest. If the cause
@@ -52,13 +52,15 @@ _BY_OTHER_GOALS = {
     *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
-"""Reasons for stopping that may be due to goals sent by another program."""
+"""A stop for one of these reasons may be due to goals sent by another program."""
 
 _BY_LOST_TORQUE = {
     *(Cause.NOT_FOLLOWING, Cause.FROZEN, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
-"""Reasons for stopping that may be due to a servo without torque. Torque Enable is then read before torque is cut."""
+"""A stop for one of these reasons may be due to a servo without torque. Torque Enable is then read before torque is
+cut.
+"""
 
 _BRAKING_WATCHDOG_S = 0.04
 """Timeout of the Bus Watchdog while the arm is braked [s]. It is shorter than during the experiment, which must allow

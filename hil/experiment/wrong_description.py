@@ -21,7 +21,7 @@ from hil.plan.chain_model import known_chain
 from hil.runs.recording import Phase
 
 CONTRADICTS = frozenset({Cause.UNEXPECTED, Cause.WRONG_SIGN})
-"""Causes of a stop by a motion that contradicts the description."""
+"""A stop for one of these reasons means that the motion contradicts the description."""
 
 
 def doubt_spatial_description(config: Config, error: BaseException, samples: NDArray[np.void]) -> None:

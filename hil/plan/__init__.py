@@ -1,1 +1,1 @@
-"""Commands of the experiment: excitation, software spring and damper, brake."""
+"""Commands of the experiment: excitation, software spring and damper, and brake."""

@@ -15,7 +15,7 @@ from hil.plan.sampled_loop import SampledLoop
 
 _POSES = 40
 _HIGHEST_HZ = 5000.0
-"""Rate above which no sufficient rate is sought [Hz]."""
+"""Upper end of the search for a sufficient rate [Hz]."""
 
 
 def chain_too_slow(config: Config) -> str:

@@ -168,5 +168,5 @@ class Obedience:
 
 
 def _drives(lacking: float, velocity: float) -> bool:
-    """Whether the unexplained torque, -lacking, accelerates the joint."""
+    """Whether the unexplained torque (the negative of `lacking`) accelerates the joint."""
     return -lacking * velocity > 0.0 and abs(velocity) > MOVES_RAD_S

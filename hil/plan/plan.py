@@ -76,7 +76,7 @@ class Plan:
     settle_within: float
     drift_within: float
     warm_up_periods: int = 0
-    """Number of warm-up periods of the first multisine, played before those that may be used."""
+    """Number of warm-up periods of the first multisine, played before the periods that may be used."""
     lower_samples: int = 0
     """Maximum number of samples for lowering a spatial arm that has been stopped."""
 

@@ -142,7 +142,7 @@ def seldom_read_back(bus: ServoBus, exchange: ReadBackExchange, off_wire: float)
 
 
 def _faster(first: ExchangeMode, second: ExchangeMode) -> ExchangeMode:
-    """Return the faster of two measurements of one mode, with the larger number of lost replies."""
+    """Return the faster of two measurements of one mode, but with the larger of their numbers of lost replies."""
     return replace(min(first, second, key=lambda mode: mode.usual_s), lost=max(first.lost, second.lost))
 
 

@@ -38,7 +38,7 @@ WRITTEN = frozenset({"Operating Mode", "Current Limit", _GOAL_PWM})
 """Settings that this program writes itself."""
 
 _LATE = frozenset({Cause.LATE, Cause.MISSING})
-"""Reasons for stopping a run that may be due to a longer Return Delay Time."""
+"""A stop for one of these reasons may be due to a longer Return Delay Time."""
 
 _MOVED = frozenset(
     {
@@ -56,12 +56,12 @@ _MOVED = frozenset(
         Cause.EARLY_MOTION,
     }
 )
-"""Reasons for stopping a run that may be due to changed settings other than Return Delay Time."""
+"""A stop for one of these reasons may be due to changes of settings other than Return Delay Time."""
 
 EXPLAINED = _MOVED | _LATE
 
 _AT_A_LIMIT = frozenset({Cause.POSITION, Cause.VELOCITY})
-"""Reasons for stopping a run that may be due to excessive torque alone."""
+"""A stop for one of these reasons may be due to excessive torque alone."""
 
 _MODES_SEEN_S = 0.06
 """If the operating modes were last read back within this time [s] before the run was stopped, a mode that now differs
