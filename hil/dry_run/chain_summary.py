@@ -82,7 +82,7 @@ def unsafe(config: Config, foreseen: ChainPrediction) -> str:
 
 
 def nearest_limit(peaks: Prediction) -> tuple[int, int]:
-    """Return the index of the quantity (in QUANTITIES) and of the joint whose limit the arms are most likely to
+    """Return the indices of the quantity (in QUANTITIES) and the joint whose limit the arms are most likely to
     reach.
     """
     touched = (peaks.shares[:, :GUARDED] >= 1.0).any(axis=0)

@@ -119,8 +119,8 @@ class Prediction:
         return origin
 
     def _middle(self) -> tuple[Array, Array]:
-        """Medians of the shares, and their spreads above the medians (quantities, joints). Only the upper half counts,
-        because the distribution of the peaks is skewed towards the limit.
+        """Medians of the shares, and their spreads above the medians (quantities, joints). The spreads are computed
+        from the shares above the median only, because the peaks are skewed towards the limit.
         """
         middle = np.median(self.shares, axis=0)
         above = np.maximum(self.shares - middle, 0.0)

@@ -92,8 +92,8 @@ class ChainWatch:
         self._velocity = np.zeros(n)
         """Latest velocities (joints,) [rad/s]."""
         self._hit_at, self._hit_speed = np.full(n, -np.inf), np.zeros(n)
-        """Time of each joint's latest possible impact on an end stop near its rest angle [s], and its speed before that
-        impact [rad/s].
+        """When each joint last appeared to hit an end stop near its rest angle [s], and its speed before that impact
+        [rad/s].
         """
 
     def look(self, state: State) -> None:
@@ -104,7 +104,7 @@ class ChainWatch:
 
     @property
     def residual(self) -> Residual:
-        """The part of the torque that the model does not explain, for the latest sample."""
+        """How far the model explains the torque in the latest sample."""
         return Residual(self._observer.lacking, self._observer.torque, self._observer.is_beyond)
 
     def observe(self, state: State) -> int:

@@ -1,4 +1,4 @@
-"""Compare successive periods. This is done sample by sample, to avoid a burst of work at the end of a period.
+"""Compare successive periods sample by sample. This avoids a burst of work at the end of a period.
 
 Differences are measured as in `hil.estimator.data.periodicity.settling_difference`, but accumulated during the period.
 

@@ -107,7 +107,7 @@ def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -
 
 
 def _faster(config: Config, options: PilotOptions) -> list[float]:
-    """The experiment's band [Hz] with a higher lower limit, as far as `options` allow; [] if it cannot be raised.
+    """The experiment's band [Hz], with its lower limit raised as far as `options` allow; [] if it cannot be raised.
 
     If static friction far exceeds kinetic friction, a torque that moves the joint at low frequencies moves it too far.
     """

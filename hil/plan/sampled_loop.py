@@ -47,8 +47,8 @@ class SampledLoop:
         return int(np.argmax(np.diagonal(self.mass[pose]) * velocity**2))
 
     def sufficient_rate(self, rate: float, highest: float) -> float | None:
-        """Find the rate [Hz] from which on the loop is stable; None if even `highest` is too low. rate: a rate at which
-        the loop is unstable.
+        """Find the rate [Hz] above which the loop is stable; None if even `highest` is too low. rate: a lower rate, at
+        which the loop is unstable.
         """
         low, high = rate, 1.5 * rate
         while not self.is_stable(high):

@@ -81,7 +81,7 @@ def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
 
 
 def said_of_the_rest(config: Config, lies: Config) -> str:
-    """Return sentences saying that the arm does not lie in arm.rest_pose and at which angles its joints are instead."""
+    """Return a message that the arm does not lie in arm.rest_pose, with the actual angles of its joints."""
     each = zip(config.joints, lies.arm.rest_pose, config.arm.rest_pose, strict=True)
     away = [
         f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})"
