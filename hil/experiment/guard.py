@@ -109,7 +109,7 @@ class Guard:
         self._silence = Silence(config, interval, patience, lowers_since)
         self._patience = patience or float("inf")
         self._late_after = self._patience + LATE_WAKE_UP_S
-        """Duration above which an exchange shows that this computer is busy [s]."""
+        """An exchange that takes longer than this [s] shows that this computer is busy."""
         self._heard_instead = heard_instead
         self._deadlines = Deadlines(config, heard_instead, any_share=is_lowering)
         self._longest_gap = safety.watchdog

@@ -104,11 +104,11 @@ JOLT = np.dtype(
 )
 """Statistics of the changes of a joint's velocity; all are initially zero, except `begun`, which is minus infinity.
 
-square: mean square of ordinary changes [rad^2/s^2], over age [s]. squared, since: integral of the squared changes that
-are not yet included because they may belong to a jolt, and the time that it covers [s]. change: first change of a
-possible jolt [rad/s]. begun: time of that change [s]. impact: largest change of velocity so far that was not part of a
-jolt, decaying with time [rad/s]. count, oldest: number of earlier velocities stored, and the row of the oldest.
-reversed: whether the joint reversed in the first change of a possible jolt.
+square, age: mean square of ordinary changes [rad^2/s^2], and the time that it covers [s]. squared, since: integral of
+the squared changes that are not yet included because they may belong to a jolt, and the time that it covers [s].
+change: first change of a possible jolt [rad/s]. begun: time of that change [s]. impact: largest change of velocity so
+far that was not part of a jolt, decaying with time [rad/s]. count, oldest: number of earlier velocities stored, and the
+row of the oldest. reversed: whether the joint reversed in the first change of a possible jolt.
 """
 
 
@@ -204,8 +204,8 @@ def _watch_loop(
 ) -> int:
     """Process a sample: both checks in one call, since entering compiled code costs as much as a check itself.
 
-    Returns 0, or _JOLTED times the number of the joint that jolted (counted from 1) plus that of the joint whose motion
-    is inconsistent.
+    Returns _JOLTED times the number of the joint that jolted, plus the number of the joint whose motion is
+    inconsistent. Both are counted from 1; a number is 0 if there is no such joint.
 
     velocities: the latest ones, as `_jolting` needs them. m, rests, past, k: the observer's arrays. before, after:
     times of the exchange [s].

@@ -233,7 +233,7 @@ def _try_again(bus: ServoBus, note: Note) -> None:
 
 def _why_silent(bus: ServoBus, stop: SafetyStop) -> str:
     """Report late replies that arrived after torque was cut. Otherwise, if no servo was heard, name those that answered
-    later: a silent servo hides the replies of those after it.
+    later: a silent servo hides the replies of the servos after it.
     """
     report = bus.torque_off_report
     if stop.unheard is None or report is None:
@@ -246,7 +246,7 @@ def _why_silent(bus: ServoBus, stop: SafetyStop) -> str:
         return ""
     return (
         f"No servo replied when the arm was stopped. Afterwards, {' and '.join(heard)} answered and "
-        f"{' and '.join(map(str, silent))} did not: a silent servo hides the replies of those after it. Check its "
+        f"{' and '.join(map(str, silent))} did not: a silent servo hides the replies of the servos after it. Check its "
         "cable and its supply."
     )
 

@@ -191,7 +191,7 @@ class StatusCheck:
                 "Either another program or controller is commanding it (stop that program or unplug that controller), "
                 "or goals are being corrupted on the bus (check the adapter and the cable)."
             )
-        return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {self.why_lost()}"
+        return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier goal too. {self.why_lost()}"
 
     def _is_recent(self, joint: int, late: int) -> bool:
         """Whether the servo's clock, which shows delays of several ms, rules out replies that are `late` cycles old."""

@@ -49,7 +49,7 @@ class ChainGains:
         return StabiliserConfig(stiffness=_rounded(self.stiffness_at(rate)), damping=_rounded(self._damping_at(rate)))
 
     def stiffness_at(self, rate: float) -> Array:
-        """Stiffness of each joint (joints,) at a rate [Hz], before rounding [N m/rad]."""
+        """Stiffness of each joint (joints,) [N m/rad] at a sample rate [Hz], before rounding."""
         return np.minimum(self.stiffness, most_stiffness(rate, self._damping_at(rate), self.friction))
 
     def _damping_at(self, rate: float) -> Array:
@@ -57,7 +57,7 @@ class ChainGains:
 
     @property
     def sufficient_rate(self) -> float:
-        """Lowest rate at which no joint's spring is softened [Hz]."""
+        """Lowest sample rate [Hz] at which no joint's spring is softened."""
         product = DELAY_SAMPLES * self.stiffness / MOST_DRIVING  # of rate and damping
         grown = MOST_DAMPING * np.maximum(self.lightest, 1e-12)  # damping per rate, up to `damping`
         root = np.sqrt(self.friction**2 + 4.0 * grown * product)

@@ -81,8 +81,8 @@ def proposed(config: Config, belief: Belief, springs: Mask) -> StabiliserConfig:
 
 
 def _at_rate(rate: float, stiffness: Array, damping: Array, friction: Array, lightest: Array) -> tuple[Array, Array]:
-    """Return stiffness and damping for a rate [Hz]: as given, or with a stronger damper and, if necessary, a softer
-    spring.
+    """Return stiffness and damping for a sample rate [Hz]: as given, or with a stronger damper and, if necessary, a
+    softer spring.
 
     friction: least expected viscous friction (joints,) [N m s/rad]. lightest: smallest inertia (joints,) [kg m^2].
     """

@@ -88,8 +88,8 @@ class Brake:
         self._first: tuple[list[float], list[float]] | None = None
 
     def goals(self, state: State) -> list[float] | None:
-        """Goal currents [A] for this sample; None if braking is over: the arm is at rest, a reply is missing, or a
-        joint accelerates.
+        """Goal currents [A] for this sample; None if braking is over because the arm is at rest, a reply is missing, or
+        a joint accelerates.
         """
         velocities = self._recent.believed(state)
         speeds = [abs(velocity) for velocity in state.velocity]

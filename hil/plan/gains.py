@@ -13,12 +13,14 @@ MOST_DRIVING = 0.3
 
 
 def most_damping(rate: float, lightest: Array) -> Array:
-    """Largest damping of each joint [N m s/rad] at a rate [Hz]. lightest: smallest inertia (joints,) [kg m^2]."""
+    """Largest damping of each joint [N m s/rad] at a sample rate [Hz]. lightest: smallest inertia (joints,)
+    [kg m^2].
+    """
     return MOST_DAMPING * rate * lightest
 
 
 def most_stiffness(rate: float, damping: Array, friction: Array) -> Array:
-    """Largest stiffness of each joint [N m/rad] at a rate [Hz]. damping: gain of the damper (joints,) [N m s/rad].
-    friction: viscous friction of the joint itself (joints,) [N m s/rad].
+    """Largest stiffness of each joint [N m/rad] at a sample rate [Hz]. damping: gain of the damper (joints,)
+    [N m s/rad]. friction: viscous friction of the joint itself (joints,) [N m s/rad].
     """
     return MOST_DRIVING * rate / DELAY_SAMPLES * (damping + friction)

@@ -71,7 +71,7 @@ class Residual(NamedTuple):
 class _Test:
     """A test of a joint, during which its goal is removed.
 
-    since: its beginning [s]. drives: whether the unexplained torque accelerated the joint.
+    since: time at which it began [s]. drives: whether the unexplained torque accelerated the joint.
     """
 
     since: float

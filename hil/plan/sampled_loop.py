@@ -31,15 +31,17 @@ class SampledLoop:
     lag: Array
 
     def growth(self, rate: float) -> float:
-        """Largest factor per sample by which a motion about any pose grows at a rate [Hz]; below 1, it decays."""
+        """Largest factor by which a motion about any pose grows per sample at this sample rate [Hz]; below 1, every
+        motion decays.
+        """
         return float(np.abs(np.linalg.eigvals(self._step(rate))).max())
 
     def is_stable(self, rate: float) -> bool:
-        """Whether every motion about every pose decays at a rate [Hz]."""
+        """Whether every motion about every pose decays at this sample rate [Hz]."""
         return self.growth(rate) <= STABLE
 
     def fastest_growing(self, rate: float) -> int:
-        """The joint that has the most kinetic energy in the fastest-growing motion at a rate [Hz]."""
+        """The joint that has the most kinetic energy in the motion that grows fastest at this sample rate [Hz]."""
         n = len(self.stiffness)
         values, vectors = np.linalg.eig(self._step(rate))
         pose, mode = np.unravel_index(np.argmax(np.abs(values)), values.shape)
@@ -47,8 +49,8 @@ class SampledLoop:
         return int(np.argmax(np.diagonal(self.mass[pose]) * velocity**2))
 
     def sufficient_rate(self, rate: float, highest: float) -> float | None:
-        """Find the rate [Hz] above which the loop is stable; None if even `highest` is too low. rate: a lower rate, at
-        which the loop is unstable.
+        """Find the sample rate [Hz] above which the loop is stable; None if even `highest` is too low. rate: a lower
+        rate, at which the loop is unstable.
         """
         low, high = rate, 1.5 * rate
         while not self.is_stable(high):

@@ -162,7 +162,7 @@ def _name(number: int, found: Found, ask: Ask) -> str:
 def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
     """Determine in which direction Present Position increases; return +1 if counter-clockwise, otherwise -1.
 
-    The arm is seen from the side on which it points to the right when it is lifted from hanging.
+    The arm is viewed from the side from which it points to the right when it is lifted from its hanging pose.
     """
     before = servo.read("Present Position")
     given = {"1": 1, "+1": 1, "-1": -1}

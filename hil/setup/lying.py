@@ -22,7 +22,7 @@ AFTER_A_RUN = 2.0
 """
 
 NEAR_RAD = 0.02
-"""Largest deviation from arm.rest_pose at which it is still used as the rest pose [rad]."""
+"""If no joint deviates from arm.rest_pose by more than this [rad], the motion starts and ends at arm.rest_pose."""
 
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
 """After torque is cut, a joint's motion is reported if it exceeds the first value [rad]. No motion is reported if,

@@ -201,7 +201,7 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
         tripped = servo.read("Bus Watchdog") == WATCHDOG_TRIPPED
         if tripped:
             yield Finding(
-                Level.OK, str(joint), "goals", "refused because its Bus Watchdog has tripped; a run clears it"
+                Level.OK, str(joint), "goals", "refused because its Bus Watchdog has tripped; the next run clears this"
             )
             continue
         fix = (

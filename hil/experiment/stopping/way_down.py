@@ -120,7 +120,8 @@ class WayDown:
     def _is_silent_too_long(self, latest: State, whole: State) -> bool:
         """Whether replies have been missing for longer than lowering can tolerate.
 
-        At most one packet is sent to find out: every packet also resets the watchdog of a servo whose ID has changed.
+        At most one packet is sent to find this out, because every packet also resets the watchdog of a servo whose ID
+        has changed.
         """
         since = self._clock.now() - whole.time_before_write
         if since <= BRIDGED_ALONE_S or since > BRIDGED_S:

@@ -68,23 +68,23 @@ class ServoSession:
     _say: Say
     saved: SavedSettings
     settings: Settings = field(default_factory=dict)
-    """The servos' settings at the beginning, as read by `settings_now`."""
+    """The servos' settings at the beginning of the session, as read by `settings_now`."""
     lay: Lies = field(default_factory=dict)
-    """Positions of the servos at the beginning."""
+    """Positions of the servos at the beginning of the session."""
     _delays: dict[Joint, int] = field(default_factory=dict)
-    """Return Delay Time of each servo at the beginning [2 us]."""
+    """Return Delay Time of each servo at the beginning of the session [2 us]."""
     _is_ours: bool = False
     """Whether the servos belong to the arm and no other program holds them, so that they may be written to."""
     _on_again: dict[Joint, int] = field(default_factory=dict)
-    """Servos whose torque another program has switched on since it was cut, with the number of times that it was cut
-    again.
+    """Servos whose torque another program has switched on since this program cut it, each with the number of times that
+    it was cut again.
     """
     _torque: dict[Joint, bool | None] = field(default_factory=dict)
     """Whether each servo's torque was on at the latest reading; None if unknown (`ServoBus.torque_now`)."""
     shared: int = 0
     """Number of inner sessions that have used the bus."""
     was_stopped: bool = False
-    """Whether the last inner session ended with an exception: the arm went limp earlier than planned."""
+    """Whether the last inner session ended with an exception, so that the arm went limp earlier than planned."""
 
     def begin(self, config: Config, folder: Path | None) -> None:
         """Check that the servos answer and that no other program holds the arm, then save their settings.
@@ -290,7 +290,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
 
 
 def _end(session: ServoSession, stopped: BaseException | None) -> None:
-    """Restore the settings, and report what could not be restored with the exception that ends the session.
+    """Restore the settings. Add a report of what could not be restored to the exception that ends the session.
 
     If a signal arrives meanwhile, its exception ends the session in place of `stopped`, with the same notes.
     """
@@ -313,7 +313,7 @@ def _end(session: ServoSession, stopped: BaseException | None) -> None:
 
 
 def has_moved() -> bool:
-    """Whether an earlier run of this session may have left the arm away from its rest pose, held by friction."""
+    """Whether an earlier run of this session may have left the arm away from its rest pose, where friction holds it."""
     outer = _outermost.get()
     return outer is not None and outer.shared > 1
 
