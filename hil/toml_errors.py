@@ -31,7 +31,7 @@ _BOUNDS = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}
 
 
 class _PlainErrors(type(BaseModel)):  # type: ignore[misc]  # pydantic's metaclass has no public name
-    """Raises errors with the text of `describe`, not pydantic's own, when an instance is created in Python.
+    """If an instance created in Python is invalid, raises an error with the text of `describe` instead of pydantic's.
 
     Tables read from a file are not created by a call, so their errors keep their location in the file.
     """
@@ -57,7 +57,7 @@ else:
 
 
 class Described(_Table):
-    """An immutable table of a TOML file that may also be created in Python, where errors are plain ValueErrors."""
+    """An immutable table of a TOML file. It can also be created in Python; errors are then plain ValueErrors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -160,7 +160,7 @@ def _as_list(detail: Any, joints: int | None) -> str:
 
 
 def _unit_hint(detail: Any, root: type[BaseModel]) -> str:
-    """Name the unit in which a number beyond its bounds would make sense, and say what to write."""
+    """Name a unit in which an out-of-range number would make sense, and say what to write instead."""
     value = detail["input"]
     if detail["type"] not in _BOUNDS or isinstance(value, bool) or not isinstance(value, int | float):
         return ""

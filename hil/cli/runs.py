@@ -12,7 +12,7 @@ from hil import strict_json
 from hil.cli.options import Json, RunPath
 
 _WHOLE = 100.0
-"""Detectable change [%] above which no value is printed for a term, because the runs reveal nothing about it."""
+"""Detectable change [%] above which no value is printed for a term: the runs then reveal nothing about that term."""
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -27,7 +27,7 @@ _IN_MJCF = ("offset", "lag", "lag_ratio", *TILT)
 
 
 def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
-    """Write the URDF `path`; return what URDF cannot represent. Raises ExportError."""
+    """Write the URDF file `path`; return what URDF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
     if is_mjcf(found.path):
         return _export_own_urdf(found, model, path)
@@ -97,7 +97,7 @@ def _export_own_urdf(found: ChainLinks, model: ChainArmModel, path: Path) -> lis
 
 
 def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
-    """Write the MJCF `path`; return what MJCF cannot represent. Raises ExportError."""
+    """Write the MJCF file `path`; return what MJCF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
     root = ET.Element("mujoco", model=found.path.stem)
     solids = solids_of(found.arm)

@@ -28,14 +28,16 @@ HALVINGS = 12
 LEAST_LEFT = 0.1  # of a link's mass, after separating what held joints move
 FAR = 3.0  # standard errors between physical links and identified parameters above which a note is added
 DIFFERENT, USELESS = 0.01, 0.2
-"""Relative RMS differences between a joint's torques in the file and those identified, above which a warning is given
-or the export is refused.
+"""Limits on the relative RMS difference between a joint's torques in the file and the identified ones. Above the first,
+a warning is given; above the second, the export is refused.
 """
 LITTLE_PULL = 1e-3
-"""Weight of the description if the usual one draws the torques away from uncertain identified values."""
+"""Weight of the description if the usual weight pulls the torques away from identified values that are uncertain."""
 MOTIONS, SPEED, ACCELERATION = 200, 1.0, 10.0  # random poses; RMS velocity [rad/s] and acceleration [rad/s^2]
 NOT_EXACT = "the identified arm exactly: "
-"""Beginning of the sentence about what a file cannot represent if its arm is not equivalent to the identified one."""
+"""Beginning of the first sentence about what a file cannot represent, if its arm is not equivalent to the identified
+one.
+"""
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,8 @@ def _refusal(model: ChainArmModel, different: Array) -> str:
 
 
 def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
-    """Separate a link from the parts that its held joints move, such as gripper fingers, which keep their inertia.
+    """Separate a link from the parts that held joints move, such as gripper fingers; these parts keep their own
+    inertia.
 
     If the described masses of these parts leave no physically possible body for the link itself, the masses are
     multiplied by a common fraction, which is halved until a body is possible. Returns the link's body and that
@@ -143,7 +146,7 @@ def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
 
 
 def _same_groups(base: BaseParameters, groups: Mapping[str, str]) -> bool:
-    """Return whether these groups equal those of the base parameters, apart from rounding of their factors."""
+    """Return whether these groups and those of the base parameters are equal, up to rounding of the factors."""
     if set(groups) != set(base.names):
         return False
     return all(_same_sum(group, groups[name]) for name, group in zip(base.names, base.groups, strict=True))

@@ -62,7 +62,7 @@ class Written:
 
     @property
     def warning(self) -> str:
-        """How far the arm in the file is from the identified one; "" if they are dynamically equivalent."""
+        """How the arm in the file differs from the identified one; "" if they are dynamically equivalent."""
         why = next(iter(self.left_out), "")
         if not why.startswith(NOT_EXACT):
             return ""

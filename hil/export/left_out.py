@@ -9,14 +9,14 @@ from hil.estimator.chain.model.tilt import MEANINGS
 from hil.estimator.models.terms import kind_of, term_of
 
 LEVEL = 1e-6
-"""Horizontal component of gravity in the base's frame, relative to gravity, up to which the base counts as upright."""
+"""The base counts as upright if, in its frame, the horizontal component is at most this fraction of gravity."""
 
 _SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torque_scale")
 """Terms that need no sentence, because every robot description has them or because `torque_constants` reports them."""
 
 
 def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:
-    """One sentence per model parameter that the format cannot represent. carried: terms that it can represent."""
+    """One sentence per model parameter that the format cannot represent. carried: terms that it does represent."""
     elsewhere = (*_SAID_ELSEWHERE, *carried)
     return [_sentence(name, value) for name, value in model.values.items() if kind_of(name) not in elsewhere]
 

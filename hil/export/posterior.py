@@ -1,7 +1,7 @@
 """Arms drawn from the posterior of an identification, for domain randomisation: one file per arm, one table for all.
 
-The parameters are drawn from a normal distribution with the estimated covariance. One factor common to all torques is
-also drawn, because the torque constant is known far less accurately than anything else. The motion reveals the ratios
+The parameters are drawn from a normal distribution with the estimated covariance. A factor common to all torques is
+also drawn, because the torque constants are known far less accurately than anything else. The motion reveals the ratios
 of the joints' constants, so only a common factor remains unknown; its uncertainty is that of the best-known joint's
 constant. The torque per goal (in A or V) is scaled with it, so that all drawn arms respond to the same goals in the
 same way.
@@ -160,8 +160,8 @@ def _matched(rng: np.random.Generator, samples: int, count: int) -> Array:
 def _physical(
     source: Source, names: tuple[str, ...], mean: Array, covariance: Array, values: Array, rng: np.random.Generator
 ) -> tuple[Array, int]:
-    """Redraw every arm with negative inertia or friction, or without physically possible masses; return the draws and
-    how many were replaced.
+    """Redraw every arm that has a negative inertia or friction, or no physically possible masses. Return the draws and
+    the number of replaced ones.
     """
     root, redrawn = _root(covariance), 0
     for _ in range(_TRIES):

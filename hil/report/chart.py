@@ -44,7 +44,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Matrix:
-    """A square matrix of values from -1 to 1 with the same labels on both axes; NaN is left blank."""
+    """A square matrix of values from -1 to 1, with the same labels on both axes. NaN cells are left blank."""
 
     name: str
     title: str

@@ -377,14 +377,14 @@ class RunFolder:
 
 
 def _urdfs(config: Config) -> set[Path]:
-    """URDF files that the configuration names; a copy of the configuration finds them in its own folder."""
+    """URDF files that the configuration names. A copy of the configuration expects them in its own folder."""
     chain = None if config.fake is None else config.fake.chain
     named = [config.arm.urdf, None if chain is None else chain.urdf]
     return {Path(each) for each in named if each is not None}
 
 
 def _has_samples(path: Path) -> bool:
-    """Whether anything was recorded in the file; true if it cannot be read."""
+    """Whether the file holds any recorded sample; also true if the file cannot be read."""
     from hil.runs.recording import Phase
 
     try:
@@ -396,7 +396,9 @@ def _has_samples(path: Path) -> bool:
 
 @cache
 def _versions() -> dict[str, str]:
-    """Return the versions of the packages that a result depends on; reading them takes as long as 100 bus exchanges."""
+    """Return the versions of the packages that a result depends on. Reading the versions takes as long as 100 bus
+    exchanges.
+    """
     return {name: version(name) for name in _PACKAGES}
 
 

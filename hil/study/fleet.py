@@ -54,7 +54,7 @@ class FleetArm:
 class Fleet:
     """Comparison of the arms of one type.
 
-    unlike: outliers, the largest first. This and `spreads` are empty for too few arms.
+    unlike: outliers, the largest first. With too few arms, `unlike` and `spreads` are empty.
     """
 
     type: str

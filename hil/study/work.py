@@ -55,7 +55,7 @@ class Spec:
 
 
 class WrongVersions(Exception):
-    """A worker that joined later has package versions other than those with which the study was started."""
+    """A worker that joined later has different package versions from those with which the study was started."""
 
 
 class OutOfTime(Exception):

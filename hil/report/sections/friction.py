@@ -58,7 +58,7 @@ def _left_to_friction(model: ArmModel, period: PlayedPeriod, lines: Lines, harmo
 def _curve(
     data: RunData, joint: int, name: str, measured: tuple[Array, Array], simulated: tuple[Array, Array]
 ) -> Picture:
-    """Draw one joint's friction. measured, simulated: speeds and friction torques of both motions."""
+    """Draw one joint's friction. measured, simulated: speeds and friction torques of the two motions."""
     fastest = float(np.abs(measured[0][joint]).max())
     # Cubes of an even grid are denser near zero speed, where the curve bends.
     at = fastest * np.linspace(-1, 1, _CURVE) ** 3
