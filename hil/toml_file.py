@@ -148,7 +148,7 @@ def _is_within(given: tuple[str, str], name: str) -> bool:
 
 
 def _beginnings(text: str) -> list[int]:
-    """Numbers of the lines, from 1, on which a statement begins: lines within a multi-line value do not count."""
+    """Numbers, from 1, of the lines on which a statement begins. Lines within a multi-line value are left out."""
     found, line, depth = [1], 1, 0
     for token in _TOKEN.findall(text):
         line += token.count("\n")

@@ -83,7 +83,9 @@ def bounded_output() -> Iterator[None]:
 
 
 def _bounded(stream: Any, patience: "_Patience") -> Any:
-    """Return a stream to the same terminal or pipe that waits at most `patience`; return other streams unchanged."""
+    """Return a stream that writes to the same terminal or pipe but waits at most `patience`. Other streams are returned
+    unchanged.
+    """
     try:
         number = stream.fileno()
         mode = os.fstat(number).st_mode

@@ -193,7 +193,7 @@ def _planar_slips(config: "Config") -> Iterator[str]:
     if config.arm.urdf is None and config.joint_path is not None:
         yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
     if config.model.base_tilt:
-        yield "model.base_tilt: tilting a planar arm has the same effect as a zero error of joint 1: use model.zeros"
+        yield "model.base_tilt: the tilt of a planar arm has the effect of a wrong zero of joint 1: use model.zeros"
 
 
 def _path_slips(config: "Config") -> Iterator[str]:

@@ -63,9 +63,9 @@ def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
 class Geom:
     """A shape of an MJCF file, in the frame of its moving link.
 
-    link: its number; 0 for shapes fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh". size: as
-    in MuJoCo, the half edge lengths of a box, or the radius and, except for a sphere, the half length [m]; for a mesh,
-    the half edge lengths of its bounding box. Any other shape is treated as a mesh.
+    link: number of that link; 0 for shapes fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh".
+    size: as in MuJoCo, the half edge lengths of a box, or the radius and, except for a sphere, the half length [m]; for
+    a mesh, the half edge lengths of its bounding box. Any other shape is treated as a mesh.
     """
 
     link: int

@@ -155,7 +155,7 @@ def _body(element: ET.Element | None, where: str, path: Path) -> Body:
 
 
 def _check_shapes(link: ET.Element, where: str, path: Path) -> None:
-    """Raise ArmFileError for an invalid size or origin in a link's collision (otherwise visual) geometry."""
+    """Raise ArmFileError for an invalid size or origin in a link's collision geometry (or visual, if it has none)."""
     for element in link.findall("collision") or link.findall("visual"):
         _origin(element, where, path)
         for shape in element.find("geometry") or ():

@@ -186,7 +186,7 @@ def _replace_inertial(link: ET.Element, body: Body) -> None:
 
 
 def _scale_inertial(link: ET.Element, share: float) -> None:
-    comment(link, f"{share:g} of the described mass and inertia: the full values would leave none for its parent link")
+    comment(link, f"{share:g} of the described mass and inertia: the full values would leave none for the parent link")
     for element in (*link.findall("inertial/mass"), *link.findall("inertial/inertia")):
         for key, value in element.attrib.items():
             element.set(key, numbers(share * float(value)))

@@ -96,8 +96,8 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
 
 
 def _torque_difference(model: ChainArmModel, base: BaseParameters, value: Array, found: PhysicalLinks) -> Array:
-    """RMS difference between the torques of the found links and the identified ones, relative to the RMS of the joint's
-    whole torque (joints,). Both are computed in random poses within the position limits.
+    """RMS difference between each joint's torque with the exported links and the identified torque, relative to the RMS
+    of the whole torque (joints,). All torques are computed in random poses within the position limits.
     """
     rng = np.random.default_rng(1)
     limits = np.array([joint.position_limit if joint.has_limits else (-np.pi, np.pi) for joint in model.joints])
@@ -119,10 +119,10 @@ def _by_joint(model: ChainArmModel, different: Array) -> str:
 
 def _refusal(model: ChainArmModel, different: Array) -> str:
     return (
-        "No arm of physically consistent links has the identified values: with the nearest ones, the joints' torques "
-        f"differ by {_by_joint(model, different)}; at most {100.0 * USELESS:.0f} % is exported. Correct what the "
-        "verdict names (base, direction, zero_ticks, the description of the arm) and identify again. The identified "
-        "values themselves can be exported with --format toml or json."
+        "No physically consistent links have the identified values: with the closest ones, the joints' torques differ "
+        f"by {_by_joint(model, different)}; arms that differ by more than {100.0 * USELESS:.0f} % are not exported. "
+        "Correct what the verdict names (base, direction, zero_ticks, the description of the arm) and identify again. "
+        "The identified values themselves can be exported with --format toml or json."
     )
 
 

@@ -24,7 +24,8 @@ S = TypeVar("S", Source, Recorded)
 class Format(Generic[S]):
     """One format.
 
-    write: writes a file and returns what it cannot represent. file_name: default name in the run folder.
+    write: function that writes a file and returns what the format cannot represent. file_name: default name in the run
+    folder.
     """
 
     write: Callable[[S, Path], list[str]]

@@ -9,7 +9,7 @@ from hil.estimator.chain.model.tilt import MEANINGS
 from hil.estimator.models.terms import kind_of, term_of
 
 LEVEL = 1e-6
-"""The base counts as upright if, in its frame, the horizontal component is at most this fraction of gravity."""
+"""The base counts as upright if, in its frame, the horizontal part of gravity is at most this fraction of the whole."""
 
 _SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torque_scale")
 """Terms that need no sentence, because every robot description has them or because `torque_constants` reports them."""
@@ -39,7 +39,7 @@ def base_orientation(model: ChainArmModel) -> list[str]:
     x, y, z = (0.0 + np.round(gravity, 3)).tolist()
     return [
         f"the orientation of the base: in its frame, gravity is ({x:g}, {y:g}, {z:g}) m/s^2. Mount the arm accordingly "
-        "in the simulator, or set its gravity to this"
+        "in the simulator, or set the simulator's gravity to this"
     ]
 
 

@@ -56,7 +56,7 @@ Figure = Chart | Matrix
 
 
 def thin(x: Array, y: Array, most: int) -> tuple[Array, Array]:
-    """Reduce a curve to about `most` points: the lowest and the highest point of each group, in order."""
+    """Reduce a curve to about `most` points: the lowest and highest of each group of successive points, in order."""
     if len(x) <= most:
         return x, y
     count = len(x) // (most // 2)

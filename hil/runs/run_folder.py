@@ -120,7 +120,7 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._written: list[Path] = []
-        """Files without which the recording could not be used, written before it begins."""
+        """Files written before the recording begins; without them, it could not be used."""
 
     @classmethod
     def create(cls, path: Path, config: Config) -> "RunFolder":
@@ -145,7 +145,8 @@ class RunFolder:
     def refuse_lost(self) -> None:
         """Raise RunFolderError if the folder has been removed, renamed or emptied since it was created.
 
-        Servo settings and facts of the run are written to a new folder of that name, which lacks the configuration.
+        Servo settings and facts of the run may have been written since, to a new folder of that name that lacks the
+        configuration.
         """
         if gone := [each.name for each in self._written if not each.is_file()]:
             lost = RunFolderError(
@@ -202,7 +203,7 @@ class RunFolder:
         return self.path / "config.toml"
 
     def own_files(self) -> frozenset[str]:
-        """Names of the files that make up the run: those of the run, of an estimate and of the arm's description."""
+        """Names of all files that belong to the run, including those of its estimate and of the arm's description."""
         own = _OF_A_START | {"result.json", "lateness.json", "recordings.npz"}
         with suppress(RunFolderError, ConfigError):
             own |= {urdf.name for urdf in _urdfs(self.load_config())}

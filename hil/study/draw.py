@@ -131,7 +131,7 @@ def recordings(study: Study) -> list[Path]:
 
 
 def _recorded(folder: Path) -> Iterator[Path]:
-    """Yield run folders; the steps of a pilot inside one are not separate runs."""
+    """Yield run folders. The steps of a pilot inside a run folder do not count as separate runs."""
     if (folder / "samples.npy").is_file() and (folder / "config.toml").is_file():
         yield folder
         return

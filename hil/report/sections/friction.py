@@ -31,8 +31,8 @@ def friction(data: RunData) -> Section | None:
     simulated_dots = _left_to_friction(data.model, period, lines_of(period.predicted), harmonics)
     pictures = [_curve(data, joint, name, measured_dots, simulated_dots) for joint, name in enumerate(data.names)]
     words = (
-        "Dots: commanded torque minus the model's inertia and gravity torque, once for the measured motion and once "
-        "for the model's own. Deriving accelerations from positions alone smooths every reversal, so "
+        "The dots show the commanded torque minus the model's inertia and gravity torque: one set for the measured "
+        "motion, one for the simulated motion. Accelerations derived from positions are smoothed at every reversal, so "
         "near standstill both sets deviate equally from the curve; there, static friction can also take any value that "
         "holds the joint. If the friction model is right, the two sets of dots agree.",
     )
