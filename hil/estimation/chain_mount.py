@@ -100,7 +100,7 @@ def _on_the_other_side(arm: ArmDescription, opposed: Sequence[Opposed]) -> str:
 
 
 def _mount_said(gravity: Array) -> str:
-    """Describe a mount in words. gravity: along an axis of the base, or in any other direction."""
+    """Describe in words how the base is mounted, given gravity in its frame (3,)."""
     down = gravity / np.linalg.norm(gravity)
     axis = int(np.argmax(np.abs(down)))
     if abs(down[axis]) < 1.0 - 1e-6:

@@ -36,7 +36,7 @@ _SIGMAS = 3.0
 """Largest deviation of a reading that is attributed to noise, in standard deviations."""
 
 _QUANTILE, _OF_NORMAL = 0.25, 0.3186
-"""Noise is estimated from this quantile of its magnitude, because goals that are altered now and then must not count as
+"""Noise is estimated from this quantile of its magnitude, because goals that are altered occasionally must not count as
 noise. The second value is the same quantile for the standard normal distribution.
 """
 

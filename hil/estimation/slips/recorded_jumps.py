@@ -115,7 +115,7 @@ def _weights(time: Array) -> Array:
 
 
 def _is_step(time: Array, position: Array, noise: float) -> bool:
-    """Whether a step in the middle describes the positions much better than a bad reading or the kink of an impact."""
+    """Whether a step in the middle fits the positions much better than one bad reading or an impact (a kink) does."""
     at = (time - 0.5 * (time[SIDE - 1] + time[SIDE])) / (time[-1] - time[0])
     smooth = [at**order for order in range(ORDER + 1)]
 
