@@ -107,7 +107,7 @@ class _Patience:
     def __init__(self, heard: int) -> None:
         self._heard = heard
         self._since: float | None = None
-        """Time of the signal or of the last write after it [s]; None before a signal."""
+        """Time of the signal or of the last write after it [s]; None until a signal arrives."""
         self.signal: int | None = None
         """The first signal that asked the program to end."""
         self.has_discarded = False

@@ -64,8 +64,8 @@ class Geom:
     """A shape of an MJCF file, in the frame of its moving link.
 
     link: number of that link; 0 for shapes fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh".
-    size: as in MuJoCo, the half edge lengths of a box, or the radius and, except for a sphere, the half length [m]; for
-    a mesh, the half edge lengths of its bounding box. Any other shape is treated as a mesh.
+    size: as in MuJoCo, half the edge lengths of a box, or the radius and, except for a sphere, half the length [m]; for
+    a mesh, half the edge lengths of its bounding box. Any other shape is treated as a mesh.
     """
 
     link: int

@@ -137,7 +137,9 @@ def _spaced(name: str) -> str:
 
 
 def _stem(name: str) -> str:
-    """A column's name without its number or, failing that, without its last dotted part or a joint's name."""
+    """The part of a name that is common to the columns of one kind: the name without its number or, if it has none,
+    without its last dotted part or the name of a joint.
+    """
     numbered = re.sub(r"\d+", "#", name)
     if numbered != name:
         return numbered

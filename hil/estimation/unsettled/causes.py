@@ -147,5 +147,5 @@ def _drifting(recordings: Sequence[Recording]) -> tuple[str, ...]:
         f"The delay of the torque drifts from {1e3 * drift.start:+.3g} ms to {1e3 * drift.end:+.3g} ms over the "
         f"recording ({1e6 * drift.relative:+.0f} ppm): with this corrected, "
         f"{unexplained(drift.residual, drift.residual_given)}. Torque and position were timed by different "
-        "clocks: correct the times of one, or log both with the same clock.",
+        "clocks: correct the times of one of them, or log both with the same clock.",
     )
