@@ -81,7 +81,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
 
 
 def doubted_gravity(config: "Config") -> Iterator[str]:
-    """Yield a sentence if the gravity in the file differs from the configured one; the configured one is used."""
+    """Yield a sentence if the gravity in the file differs from the configured gravity, which is the one used."""
     arm = described_arm(config)
     if arm.gravity is None or np.abs(np.subtract(arm.gravity, base_gravity(config))).max() <= _SAME_GRAVITY:
         return

@@ -218,7 +218,7 @@ def _root_link(bodies: dict[str, Body], tree: dict[str, _Joint], path: Path) -> 
     children = {joint.child for joint in tree.values()}
     roots = [name for name in bodies if name not in children]
     if not roots:
-        raise ArmFileError(f"{path}: every link is a joint's child, so the links form a loop; one must be the base")
+        raise ArmFileError(f"{path}: every link is a joint's child, so they form a loop; one link must be the base")
     if len(roots) > 1:
         raise ArmFileError(
             f"{path}: links {', '.join(roots)} have no parent joint: only one base link is allowed; attach the others "

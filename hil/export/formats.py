@@ -40,7 +40,7 @@ FORMATS: Mapping[str, Format[Source]] = MappingProxyType(
         "json": Format(export_json, "arm.json"),
     }
 )
-"""Formats of an identified arm."""
+"""Formats for an identified arm."""
 
 RECORDING_FORMATS: Mapping[str, Format[Recorded]] = MappingProxyType(
     {
@@ -50,7 +50,7 @@ RECORDING_FORMATS: Mapping[str, Format[Recorded]] = MappingProxyType(
         "mat": Format(export_mat, "samples.mat"),
     }
 )
-"""Formats of a recording; they do not need an estimate."""
+"""Formats for a recording; they need no estimate."""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ _POSES = 20
 """Number of poses in which the mass matrix of a drawn spatial arm must be positive definite."""
 
 _WITH_TORQUE = ("N", "kg")
-"""Beginnings of the units of parameters that scale with the torque constant: torques, masses and their moments."""
+"""First letters of the units of parameters that scale with the torque constant: torques, masses and their moments."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def _posterior(source: Source) -> tuple[tuple[str, ...], Array, Array]:
 
 
 def _root(covariance: Array) -> Array:
-    """A matrix A with A A^T = covariance, which may be singular."""
+    """A matrix A with A A^T = covariance. The covariance may be singular."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     safe = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
@@ -227,7 +227,7 @@ def _write_table(source: Source, drawn: Drawn, path: Path) -> None:
 
 
 def _actuator(drawn: Drawn, joint: int) -> dict[str, tuple[Array, str]]:
-    """Actuator properties of each drawn arm (samples,) with their units, under the names of Isaac Lab."""
+    """Actuator properties of each drawn arm (samples,) and their units, named as in Isaac Lab."""
     facts = drawn.models[0].joints[joint - 1]
 
     def column(name: str) -> Array:

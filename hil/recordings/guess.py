@@ -132,7 +132,7 @@ def _last(name: str) -> str:
 
 
 def _spaced(name: str) -> str:
-    """Split names such as `pos_meas1` and `observation.state.0` into words, for searching."""
+    """Split names such as `pos_meas1` and `observation.state.0` into words that can be searched for."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])|[_./\[\]\-]+", " ", name)
 
 

@@ -246,9 +246,7 @@ class RunFolder:
             if self.rest_pose_path.is_file():
                 played["arm"] = ArmConfig(**{**config.arm.model_dump(), **_read_json(self.rest_pose_path)})
         except ValidationError as error:
-            raise RunFolderError(
-                f"The record of the excitation next to {self.config_path} is damaged: {error}."
-            ) from error
+            raise RunFolderError(f"The excitation stored next to {self.config_path} is damaged: {error}.") from error
         return config.model_copy(update=played)
 
     def below(self, name: str, played: Config) -> "RunFolder":

@@ -1,4 +1,4 @@
-"""Checks of a study before anything runs."""
+"""Checks performed on a study before anything runs."""
 
 import shutil
 from pathlib import Path

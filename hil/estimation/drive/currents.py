@@ -24,7 +24,7 @@ OFTEN = 0.05
 """Clipping is reported if it affects more than this fraction of the samples with large goals."""
 
 _RECENT = 4
-"""Number of latest goals that a lagging current may still be following."""
+"""Number of most recent goals that a lagging current may still be following."""
 
 _BEYOND, _BEYOND_OFTEN = 0.25, 0.02
 """A current counts as different from the commanded one if it is outside the range spanned by 0 and all recent goals by
