@@ -87,7 +87,7 @@ def diff(
     ] = None,
     json_only: Json = False,
 ) -> None:
-    """Compare two runs of an arm and test which parameters changed significantly, for example from gearbox wear."""
+    """Compare two runs of an arm and test which parameters changed significantly, for example because of wear."""
     from hil.estimation.changes.diff import diff_runs
 
     difference = diff_runs(before, after)

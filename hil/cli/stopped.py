@@ -18,7 +18,7 @@ import typer
 from hil.next_step import next_step
 
 _LOADERS, _LATER_S = frozenset({"importlib", "_frozen_importlib", "numba", "llvmlite"}), 0.02
-"""Packages whose code a signal must not interrupt: if one arrives there, it is sent again after this time [s]."""
+"""Packages whose code a signal must not interrupt: a signal that arrives there is sent again after this time [s]."""
 
 
 class Terminated(KeyboardInterrupt):

@@ -37,5 +37,5 @@ class ClearanceConfig(Table):
     )
     boxes: list[BoxConfig] = Field([], description="other obstacles")
     ignore: list[Annotated[list[str], Field(min_length=2, max_length=2)]] = Field(
-        [], description='pairs that need no clearance from each other: names of links or boxes, or "floor"'
+        [], description='pairs that need no clearance: moving links, the base, boxes or "floor"'
     )

@@ -44,7 +44,7 @@ def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
 
 
 def _nothing_recorded(run: RunFolder, shown: Path) -> list[str]:
-    """Sentences that report an empty folder that could not be removed; [] if it holds a recording or a result."""
+    """Sentences about a folder without data that could not be removed; [] if it holds a recording or a result."""
     if run.result_path.is_file() or run.samples_path.is_file() or _steps(run.path):
         return []
     return [

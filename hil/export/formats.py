@@ -22,7 +22,7 @@ S = TypeVar("S", Source, Recorded)
 
 @dataclass(frozen=True)
 class Format(Generic[S]):
-    """One format.
+    """An export format.
 
     write: function that writes a file and returns what the format cannot represent. file_name: default name in the run
     folder.

@@ -161,7 +161,7 @@ def _physical(
     source: Source, names: tuple[str, ...], mean: Array, covariance: Array, values: Array, rng: np.random.Generator
 ) -> tuple[Array, int]:
     """Redraw every arm that has a negative inertia or friction, or no physically possible masses. Return the draws and
-    the number of replaced ones.
+    the number of arms replaced.
     """
     root, redrawn = _root(covariance), 0
     for _ in range(_TRIES):

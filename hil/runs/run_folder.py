@@ -145,7 +145,7 @@ class RunFolder:
     def refuse_lost(self) -> None:
         """Raise RunFolderError if the folder has been removed, renamed or emptied since it was created.
 
-        Servo settings and facts of the run may have been written since, to a new folder of that name that lacks the
+        If servo settings or facts of the run have been written in the meantime, the folder exists again, but lacks the
         configuration.
         """
         if gone := [each.name for each in self._written if not each.is_file()]:

@@ -133,8 +133,8 @@ def executor(scheduler: str | None = None, count: int | None = None) -> Iterator
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that affects numerical results, in this process, or in a worker if Dask runs this function
-    there.
+    """Versions of everything that affects numerical results, as installed where this function runs: here, or on a Dask
+    worker.
     """
     return {"hil": __version__, **_package_versions()}
 

@@ -95,7 +95,9 @@ def _jumps(recording: Recording, joint: int) -> list[tuple[float, float]]:
 
 
 def _steps(time: Array, position: Array, uneven: Mask) -> Array:
-    """The step [rad] in the middle of each window of 2 * SIDE samples. uneven: where intervals are unequal."""
+    """The step [rad] in the middle of each window of 2 * SIDE samples. uneven: mask of the windows with unequal
+    intervals.
+    """
     windows = np.lib.stride_tricks.sliding_window_view
     sizes = np.correlate(position, _weights(np.arange(2.0 * SIDE)[None, :])[0], mode="valid")
     places = np.flatnonzero(uneven)

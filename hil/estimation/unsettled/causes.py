@@ -103,7 +103,7 @@ def _clipped(recordings: Sequence[Recording], found: Sequence[Clipped]) -> tuple
 
 
 def _unsigned(recordings: Sequence[Recording], joint: int) -> str:
-    """A sentence if the torque of a joint (from 1) never changes sign; "" otherwise."""
+    """A sentence if the torque of a joint (numbered from 1) never changes sign; "" otherwise."""
     torque = np.concatenate([each.torque[joint - 1] for each in recordings])
     if torque.min() < 0.0 < torque.max():
         return ""

@@ -302,7 +302,7 @@ def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: b
 
 
 def _foretold_said(error: float, joint: str) -> str:
-    """Describe the prediction of the last part. error: relative to the RMS torque. joint: the worst one."""
+    """Describe how well the last part is predicted. error: relative to the RMS torque. joint: the joint with it."""
     part = f"the torque in the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
     if error > 1.0:
         return (
