@@ -59,7 +59,7 @@ class JointFacts:
 class ArmModel:
     """The dynamics of an identified arm of one or two joints.
 
-    values, stds: base parameters, friction terms and drive terms, and their standard errors, by name [SI]. gravity:
+    values: base parameters, friction terms and drive terms by name [SI]. stds: their standard errors. gravity:
     gravitational acceleration in the plane of the arm [m/s^2].
     """
 
@@ -75,7 +75,7 @@ class ArmModel:
         return f"<{type(self).__name__} of {len(self.joints)} joints ({names}), {len(self.values)} parameters>"
 
     def inverse_dynamics(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
-        """Motor torques (..., joints) [N m] for a motion, including those of friction, offset, cable and cogging.
+        """Motor torques (..., joints) [N m] that produce a motion. Friction, offset, cable and cogging are included.
 
         Args:
             q: angles (..., joints) [rad].
@@ -168,7 +168,7 @@ class ArmModel:
         return list(taken.values())
 
     def _inverse(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """Motor torques (joints, ...) [N m]. The joints are also the first axis of the arguments."""
+        """Motor torques (joints, ...) [N m]. In the arguments, too, the first axis runs over the joints."""
         torque = self._rigid_body(q, dq, ddq)
         for joint, v in enumerate(dq, start=1):
             step = self._step(joint, v)
@@ -211,7 +211,7 @@ class ArmModel:
         return np.asarray(1.0 + sine * np.sin(cycles) + cosine * np.cos(cycles))
 
     def _by_angle(self, joint: int, q: Array) -> Array:
-        """Load torque of the cable and of cogging at the angles q [rad]."""
+        """Load torque due to the cable and to cogging at the angles q [rad]."""
         cycles = self.values.get(f"cogging_cycles_{joint}", 0.0) * q
         sine, cosine = (self.values.get(f"cogging_{part}_{joint}", 0.0) for part in ("sin", "cos"))
         cable = self.values.get(f"cable_stiffness_{joint}", 0.0) * q

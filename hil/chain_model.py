@@ -1,7 +1,7 @@
 """An identified spatial arm as a model; see `hil.arm_model`. Requires only numpy.
 
-In the Newton-Euler equations, the base parameters replace the links' own inertial parameters, and all eliminated
-parameters are zero.
+In the Newton-Euler equations, each link has its base parameters instead of its own inertial parameters. Parameters that
+were eliminated are zero.
 """
 
 from dataclasses import dataclass
@@ -66,7 +66,7 @@ class ChainArmModel(ArmModel):
         return self._torque(q, nothing, nothing, self.base_gravity)
 
     def _torque(self, q: Array, dq: Array, ddq: Array, gravity: Array) -> Array:
-        """Joint torques (joints, ...) [N m] without friction; the joints are the first axis of q, dq and ddq."""
+        """Joint torques (joints, ...) [N m] without friction; the first axis of q, dq and ddq runs over the joints."""
         count, shape = len(q), q.shape[1:]
         turn, place = np.broadcast_to(np.eye(3), (*shape, 3, 3)), np.zeros((*shape, 3))
         spin, spun = np.zeros((*shape, 3)), np.zeros((*shape, 3))

@@ -47,7 +47,7 @@ __all__ = [
 
 
 class Cause(Enum):
-    """What the guard detected, which decides whether the arm can be braked or lowered before its torque is cut."""
+    """What the guard detected. It determines whether the arm can be braked or lowered before its torque is cut."""
 
     POSITION = "position limit"
     VELOCITY = "velocity limit"
@@ -84,9 +84,9 @@ class Cause(Enum):
     def allows_lowering(self) -> bool:
         """Whether the servos still accept commands, so that an arm can be lowered under supervision.
 
-        A servo that has lost its watchdog still obeys commands; if the watchdog had tripped, the loss of torque would
-        be detected during lowering. A servo that has set its alert bit may still have torque; its torque state is read
-        first.
+        A servo whose watchdog was disabled still obeys commands. If the watchdog has tripped instead, the loss of
+        torque is detected during lowering. A servo that has set its alert bit may still have torque; its torque state
+        is read first.
         """
         others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
         others |= {Cause.MISSING, Cause.ALERT}
@@ -94,7 +94,7 @@ class Cause(Enum):
 
 
 class Unheard(Enum):
-    """Whose replies are missing."""
+    """Which servos' replies are missing."""
 
     ONE = "one servo of several"
     ALL = "every servo"
@@ -155,12 +155,13 @@ class ExperimentError(HilError):
 
 
 class SafetyStop(ExperimentError):
-    """The guard stopped the arm, or a dry run ruled out starting it. Example: joint 2 exceeded its position limit.
+    """The guard stopped the arm, or a dry run found that it must not start. Example: joint 2 exceeded its position
+    limit.
 
-    overruled: a servo held goals or settings that this program had not written, so the commanded torque did not cause
-    the motion, which therefore reveals nothing about the arm. unheard: whose replies were missing; None if other
-    packets arrived instead. doubts_description: the motion contradicts the description of a spatial arm. remedy: the
-    last sentences of the message, which may be replaced when more is known.
+    overruled: a servo held goals or settings that this program had not written, so the motion was not caused by the
+    commanded torque and reveals nothing about the arm. unheard: which servos' replies were missing; None if other
+    packets arrived instead, or for any other cause. doubts_description: the motion contradicts the description of a
+    spatial arm. remedy: the last sentences of the message; they may be replaced once more is known.
     """
 
     overruled = False
@@ -173,7 +174,7 @@ class SafetyStop(ExperimentError):
         self._remedy = remedy
 
     def replace_remedy(self, remedy: str) -> None:
-        """Replace the last sentences of the message; if it has none, append these."""
+        """Replace the remedy at the end of the message; if there is none, append this one."""
         self.args = (str(self).replace(self._remedy, remedy) if self._remedy else f"{self} {remedy}",)
         self._remedy = remedy
 

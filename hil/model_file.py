@@ -99,7 +99,7 @@ def read_model(path: str | PathLike[str]) -> ArmModel:
 
 
 def read_usable_result(path: Path) -> Result:
-    """Read a result that contains all the data that a model of the arm needs. Raises ResultError for any other."""
+    """Read a result that holds all the data needed for a model of the arm. Raises ResultError for any other result."""
     result = read_result(path)
     if result.arm is None:
         raise ResultError(
@@ -109,7 +109,7 @@ def read_usable_result(path: Path) -> Result:
 
 
 def model_of(result: Result, path: Path) -> ArmModel:
-    """The model in a result that was read from `path`; raises ResultError."""
+    """Return the model of the arm in a result that was read from `path`. Raises ResultError."""
     if result.arm is None:
         raise ResultError(f"{path} holds no data about the arm's joints. Run hil estimate again.")
     return _model(result.arm, result.quantities, result.chain, path)
@@ -117,7 +117,7 @@ def model_of(result: Result, path: Path) -> ArmModel:
 
 @dataclass(frozen=True)
 class _SavedModel:
-    """The parts of a result that a model needs; `hil export` writes them too."""
+    """The parts of a result that a model needs; `hil export` also writes them."""
 
     arm: ArmFacts
     parameters: Mapping[str, Quantity]

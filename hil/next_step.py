@@ -10,12 +10,12 @@ NEXT = "Next: "
 
 
 def next_step(*words: object) -> str:
-    """The line that names the next command, which is quoted for a shell."""
+    """The line that names the next command, with the command quoted for a shell."""
     return f"{NEXT}{command(*words)}"
 
 
 def command(*words: object) -> str:
-    """A `hil` command as typed in a shell, with every word quoted that the shell would split or expand."""
+    """A `hil` command as typed in a shell; words that the shell would split or expand are quoted."""
     return " ".join(["hil", *(_quoted(str(word)) for word in words)])
 
 
@@ -28,7 +28,9 @@ def _quoted(word: str) -> str:
 
 
 def steps_of(path: Path) -> list[Path]:
-    """Folders of the pilot and the later steps in a run folder, if its identification stopped before the full run."""
+    """Folders of the pilot and of later steps in a run folder whose identification ended before the full run; otherwise
+    none.
+    """
     if (path / "samples.npy").is_file() or not (path / "config.toml").is_file():
         return []
     return sorted((each.parent for each in path.glob("*/samples.npy")), key=lambda each: each.stat().st_mtime)

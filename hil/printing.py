@@ -1,4 +1,4 @@
-"""Text and tables on standard output that are never truncated in a narrow terminal."""
+"""Print text and tables on standard output, without truncating them in a narrow terminal."""
 
 from collections.abc import Iterator
 
@@ -12,7 +12,7 @@ _INDENT = 2
 
 
 class ResultConsole(Console):
-    """Standard output, without rich's colours or its handling of a closed pipe (see `hil.cli.output`)."""
+    """Standard output without rich's own handling of a closed pipe (see `hil.cli.output`)."""
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError

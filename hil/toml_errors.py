@@ -31,7 +31,7 @@ _BOUNDS = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}
 
 
 class _PlainErrors(type(BaseModel)):  # type: ignore[misc]  # pydantic's metaclass has no public name
-    """Raises errors with the text of `describe`, not pydantic's own, when an instance is created in Python.
+    """Metaclass of tables created in Python: errors have the text of `describe` instead of pydantic's own.
 
     Tables read from a file are not created by a call, so their errors keep their location in the file.
     """
@@ -57,7 +57,7 @@ else:
 
 
 class Described(_Table):
-    """An immutable table of a TOML file that may also be created in Python, where errors are plain ValueErrors."""
+    """An immutable table of a TOML file. It can also be created in Python; errors are then plain ValueErrors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -79,7 +79,7 @@ def describe(
 
 
 def _joined_alternatives(details: Sequence[Any]) -> list[Any]:
-    """Merge the errors of a value that matches none of several alternatives."""
+    """Merge the errors that pydantic reports for each alternative of a value that matches none of them."""
     joined: dict[tuple[Any, ...], Any] = {}
     for detail in details:
         if detail["type"] != "literal_error":
@@ -160,7 +160,7 @@ def _as_list(detail: Any, joints: int | None) -> str:
 
 
 def _unit_hint(detail: Any, root: type[BaseModel]) -> str:
-    """Name the unit in which a number beyond its bounds would make sense, and say what to write."""
+    """Name a unit in which an out-of-range number would make sense, and say what to write instead."""
     value = detail["input"]
     if detail["type"] not in _BOUNDS or isinstance(value, bool) or not isinstance(value, int | float):
         return ""
@@ -220,7 +220,9 @@ def meant_name(given: str, names: Sequence[str]) -> str:
 
 
 def _in_thousands(expected: str, value: object) -> str:
-    """Name the allowed number that was meant if the value is in thousands or millions, such as a rate in Mbaud."""
+    """Name the allowed number that was probably meant if the value is in thousands or millions, such as a rate in
+    Mbaud.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float):
         return ""
     for name, factor in (("thousands", 1e3), ("millions", 1e6)):
@@ -264,7 +266,7 @@ def fields_of(model: Any) -> dict[str, Any]:
 
 
 def _table(location: Sequence[str | int], root: type[BaseModel]) -> Any:
-    """Return the model of the table that contains the last part of a location."""
+    """Return the pydantic model of the table that holds the last key of a location."""
     keys = [place for place, part in enumerate(location) if isinstance(part, str) and not part.startswith(UNSAID)]
     last = max(keys, default=0)
     model: Any = root

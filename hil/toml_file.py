@@ -1,4 +1,4 @@
-"""The only reader of TOML files, so that configurations, fake arms and results follow the same rules.
+"""The only module that reads TOML files, so that the same rules apply to configurations, fake arms and results.
 
 Text is UTF-8, with or without the byte order mark that some Windows programs write.
 """
@@ -12,11 +12,11 @@ from typing import Any
 from hil.description.regular_file import not_a_file
 
 MOST_BYTES = 4_000_000
-"""Largest size of a file [bytes]: reading takes seconds per megabyte of numbers."""
+"""Largest file that is read [bytes]: parsing a megabyte of numbers takes seconds."""
 
 
 class TomlFileError(ValueError):
-    """Raised if a file cannot be read or is not TOML; the text is the complete message and names the file."""
+    """Raised if a file cannot be read or is not TOML. Its text is a complete message that names the file."""
 
 
 def load_toml(path: Path) -> dict[str, Any]:
@@ -25,7 +25,7 @@ def load_toml(path: Path) -> dict[str, Any]:
 
 
 def shortened(path: str) -> str:
-    """A path, or the beginning of one that is too long for a message."""
+    """Return a path, shortened to its beginning if it is too long for a message."""
     return path if len(path) <= 80 else f"{path[:80]}..."
 
 
@@ -142,13 +142,13 @@ def _repeated(what: str, table: str, number: int, first: int | None) -> str:
 
 
 def _is_within(given: tuple[str, str], name: str) -> bool:
-    """Whether a table and key belong to a table called `name`; a header counts as a key of the table ""."""
+    """Whether a (table, key) pair belongs to the table `name`; for a header, the pair's table is ""."""
     table, key = given
     return re.match(rf"(?:the )?\[\[?{re.escape(name)}[\].]", table or key) is not None
 
 
 def _beginnings(text: str) -> list[int]:
-    """Numbers of the lines, from 1, on which a statement begins: lines within a multi-line value do not count."""
+    """Numbers, from 1, of the lines on which a statement begins. Lines within a multi-line value are left out."""
     found, line, depth = [1], 1, 0
     for token in _TOKEN.findall(text):
         line += token.count("\n")
@@ -178,7 +178,7 @@ _SYNTAX = (
     (r"^\w[\w.-]*\s*:", "Write = between key and value, not a colon."),
     (r"[“”‘’„]", "Use straight quotes."),
 )
-"""Patterns of a rejected line without its comment and quoted strings, and the likely cause of each."""
+"""Patterns to match with a rejected line (without its comment and quoted strings), and the likely cause for each."""
 
 
 def _unquoted(line: str) -> str:

@@ -1,4 +1,4 @@
-"""Recognition of a number given in another unit: 10000 where seconds are expected may be 10 s in milliseconds.
+"""Recognition of numbers given in the wrong unit: 10000 where seconds are expected may be 10 s in milliseconds.
 
 A key's unit is taken from its description: its first words ("N m/A at the output shaft"), the text
 in brackets ("viscous friction [N m s/rad]"), or the text after a comma ("roll, pitch and yaw, rad").
@@ -63,7 +63,8 @@ def unit_of(description: str | None) -> str | None:
 
 
 def in_other_units(values: float | Sequence[float], unit: str | None, makes_sense: Callable[[float], bool]) -> str:
-    """Return "If it is in ms, write 10" for up to three other units in which every value makes sense, or "".
+    """Return a hint such as "If it is in ms, write 10" with up to three units in which every value makes sense; "" if
+    there are none.
 
     Args:
         values: the given number or list; for a list, the proposal is a list too.
@@ -94,7 +95,7 @@ def _fitting(
 
 
 def allowed_by(field: FieldInfo) -> Callable[[float], bool]:
-    """Return whether a number is within the bounds of a field or, if the field is a list, of its entries."""
+    """Return whether a number is within the bounds of a field or, for a list, within the bounds of its entries."""
     bounds = list(_bounds(field))
 
     def keeps(value: float) -> bool:

@@ -14,8 +14,8 @@ from hil.setup.finding import Finding, Level
 from hil.setup.preflight import check_arm
 
 _ALWAYS_HELD_HZ = 150.0
-"""Lowest rate [Hz] at which the stabiliser's delay certainly does not matter. From this rate on, it is not checked,
-because loading the pilot for the check takes a second.
+"""Rate [Hz] from which the stabiliser's delay certainly does not matter. At this rate and above, the delay is not
+checked, because loading the pilot for the check takes a second.
 """
 
 __all__ = ["CheckReport", "Finding", "Level", "check"]

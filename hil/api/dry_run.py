@@ -57,8 +57,8 @@ class Rehearsal:
 
     @property
     def prediction(self) -> Prediction:
-        """The prediction for the configured torque; if none is configured, for the largest safe torque or the pilot's
-        first run.
+        """The prediction for the configured torque. If none is configured, the prediction for the largest safe torque
+        or for the pilot's first run.
         """
         return self.found.prediction if isinstance(self.found, ChainDryRun) else self.found.shown
 

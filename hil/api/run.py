@@ -121,7 +121,7 @@ class Estimation(ShootingResult):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Run:
-    """A recorded run. It holds arrays and is equal only to itself; to compare two runs, compare `result`.
+    """A recorded run. Because it holds arrays, it is equal only to itself; to compare two runs, compare their `result`.
 
     config: the configuration, with the experiment that was actually run. record: the contents of run.json. samples:
     every sample taken (dtype: hil.runs.recording.sample_type). events: pairs (time on the port's clock [s], what

@@ -67,7 +67,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "hand": (fake_command.hand, "/tmp/arm 2:to=0.5 3:ticks=2500,duration=2"),
     "schema": (schema.schema, "--out hil.schema.json"),
 }
-"""Every subcommand by name: its function, and the arguments of its usage example."""
+"""For each subcommand, by name: its function, and the arguments shown in its usage example."""
 
 ALLOW_CODE = "--allow-code"
 

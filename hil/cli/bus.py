@@ -142,7 +142,7 @@ def setup(
 ) -> None:
     """Set a servo's ID, baud rate, return delay or Secondary ID. Each write requires confirmation and is read back.
 
-    All servos on this port that a killed run left with torque on, or with its settings, are restored first.
+    First, all servos on this port are restored if a killed run left them with torque on or with its settings.
     """
     from hil.cli.views.question import agrees
     from hil.cli.views.setup_view import changed, print_changes

@@ -9,7 +9,7 @@ from typer.core import TyperCommand
 from hil.toml_file import shortened
 
 _OF_THE_MACHINE = frozenset({errno.EMFILE, errno.ENFILE})
-"""Operating-system errors that do not depend on the input, namely too many open files."""
+"""Operating-system errors that are not due to the input: too many open files."""
 
 _OF_A_PATH = frozenset({errno.ENAMETOOLONG, errno.EACCES})
 """Errors that even a check for the existence of a file can raise."""
@@ -46,8 +46,8 @@ def _is_of_a_path(error: Exception) -> bool:
 def message(error: Exception) -> str:
     """Return the text to print for an error: its message and its notes.
 
-    If the error occurred while another expected error was being handled, the message of that error is included, unless
-    it is the same. If the notes name a command to type next, it comes last. Control characters are escaped.
+    If the error occurred while another expected error was being handled, the other error's message is included, unless
+    both are the same. If the notes name the next command, it comes last. Control characters are escaped.
     """
     said = str(error)
     if isinstance(error, OSError) and _is_of_a_path(error):

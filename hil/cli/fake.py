@@ -47,9 +47,9 @@ def list_faults() -> None:
 
 
 def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
-    """Move or release joints of the fake arm served at `device`: all of them, or none if one cannot be moved.
+    """Release and move joints of the fake arm served at `device`. If one of the moves is impossible, no joint moves.
 
-    Raises ConfigError, for example if the torque of one of them is on.
+    Raises ConfigError, for example if the torque of a joint to be moved is on.
     """
     try:
         for servo in release:

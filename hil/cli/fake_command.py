@@ -68,7 +68,7 @@ def hand(
 ) -> None:
     """Move joints of a fake arm while their torque is off, as a person does when calibrating an arm by hand.
 
-    If the torque of one of them is on, nothing moves, and the exit code is 2.
+    If torque is on at any of these joints, nothing moves, and the exit code is 2.
     """
     from hil.cli import fake as work
 

@@ -83,7 +83,9 @@ def bounded_output() -> Iterator[None]:
 
 
 def _bounded(stream: Any, patience: "_Patience") -> Any:
-    """Return a stream to the same terminal or pipe that waits at most `patience`; return other streams unchanged."""
+    """Return a stream that writes to the same terminal or pipe but waits at most `patience`. Other streams are returned
+    unchanged.
+    """
     try:
         number = stream.fileno()
         mode = os.fstat(number).st_mode
@@ -105,7 +107,7 @@ class _Patience:
     def __init__(self, heard: int) -> None:
         self._heard = heard
         self._since: float | None = None
-        """Time of the signal or of the last write after it [s]; None before a signal."""
+        """Time of the signal or of the last write after it [s]; None until a signal arrives."""
         self.signal: int | None = None
         """The first signal that asked the program to end."""
         self.has_discarded = False

@@ -70,7 +70,7 @@ def export(
         if drawn.inexact:
             print(
                 f"Warning: {drawn.inexact} of these arms are not equivalent to the drawn ones, because no physically "
-                "consistent links have their values; their files say how far the torques differ.",
+                "consistent links have the drawn values; the files of these arms say how far the torques differ.",
                 file=sys.stderr,
             )
         return

@@ -12,7 +12,7 @@ from hil import strict_json
 from hil.cli.options import Json, RunPath
 
 _WHOLE = 100.0
-"""Detectable change [%] above which no value is printed for a term, because the runs reveal nothing about it."""
+"""Detectable change [%] above which no value is printed for a term: the runs then reveal nothing about that term."""
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -87,7 +87,7 @@ def diff(
     ] = None,
     json_only: Json = False,
 ) -> None:
-    """Compare two runs of an arm and test which parameters changed significantly, for example from gearbox wear."""
+    """Compare two runs of an arm and test which parameters changed significantly, for example because of wear."""
     from hil.estimation.changes.diff import diff_runs
 
     difference = diff_runs(before, after)

@@ -18,7 +18,7 @@ import typer
 from hil.next_step import next_step
 
 _LOADERS, _LATER_S = frozenset({"importlib", "_frozen_importlib", "numba", "llvmlite"}), 0.02
-"""A signal does not interrupt the code of these packages; it is sent again after this time [s]."""
+"""Packages whose code a signal must not interrupt: a signal that arrives there is sent again after this time [s]."""
 
 
 class Terminated(KeyboardInterrupt):
@@ -47,7 +47,7 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 def how_to_go_on(stopped: BaseException) -> list[str]:
-    """Return the notes attached to the interruption, and the next command."""
+    """Return the notes attached to an interruption, and the command to type next."""
     return [*getattr(stopped, "__notes__", []), *same_again(stopped)]
 
 

@@ -81,7 +81,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
 
 
 def doubted_gravity(config: "Config") -> Iterator[str]:
-    """Yield a sentence if the file's gravity differs from the configured gravity, which takes precedence."""
+    """Yield a sentence if the gravity in the file differs from the configured gravity, which is the one used."""
     arm = described_arm(config)
     if arm.gravity is None or np.abs(np.subtract(arm.gravity, base_gravity(config))).max() <= _SAME_GRAVITY:
         return
@@ -193,7 +193,7 @@ def _planar_slips(config: "Config") -> Iterator[str]:
     if config.arm.urdf is None and config.joint_path is not None:
         yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
     if config.model.base_tilt:
-        yield "model.base_tilt: tilting a planar arm has the same effect as a zero error of joint 1: use model.zeros"
+        yield "model.base_tilt: the tilt of a planar arm has the effect of a wrong zero of joint 1: use model.zeros"
 
 
 def _path_slips(config: "Config") -> Iterator[str]:

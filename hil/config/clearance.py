@@ -16,7 +16,7 @@ _Floor = Annotated[
 
 
 class BoxConfig(Table):
-    """`[[clearance.boxes]]`: an obstacle, relative to the base's origin with z upwards."""
+    """`[[clearance.boxes]]`: an obstacle. Coordinates are relative to the base's origin, with z pointing upwards."""
 
     name: str = Field(min_length=1, max_length=40)
     centre: Point = Field(description="m")
@@ -37,5 +37,5 @@ class ClearanceConfig(Table):
     )
     boxes: list[BoxConfig] = Field([], description="other obstacles")
     ignore: list[Annotated[list[str], Field(min_length=2, max_length=2)]] = Field(
-        [], description='pairs of links (or "floor", or a box) that need no clearance'
+        [], description='pairs that need no clearance: moving links, the base, boxes or "floor"'
     )

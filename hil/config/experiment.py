@@ -35,7 +35,7 @@ class ExperimentConfig(Table):
     pilot: bool = Field(
         False, description="start with a small pilot run, then raise peak_torque as far as the limits allow"
     )
-    design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" uses the pilot\'s model')
+    design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" minimises standard errors')
     ramp: float = Field(1.0, ge=0, le=60, description="s, torque ramp at start and end")
     rest: float = Field(0.5, ge=0, le=60, description="s, time without torque before the motion")
     warm_up: float = Field(

@@ -95,7 +95,7 @@ def parse_recording_config(text: str, path: Path) -> RecordingConfig:
 
 
 def _relevant(values: dict[str, Any]) -> dict[str, Any]:
-    """The values without the tables and keys that only an experiment needs; unknown ones remain."""
+    """The values without the tables and keys that only an experiment needs; unknown tables and keys remain."""
     kept = _without(values, RecordingConfig, Config)
     if isinstance(kept.get("arm"), dict):
         kept["arm"] = _without(kept["arm"], ArmFacts, ArmConfig)

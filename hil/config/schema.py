@@ -56,7 +56,8 @@ __all__ = [
 ]
 
 LYING_RAD = 0.25
-"""Largest deviation of a spatial arm from its rest pose at the start, unless arm.rest_tolerance is given [rad]."""
+"""Largest allowed deviation of a spatial arm from its rest pose at the start [rad], unless arm.rest_tolerance is given.
+"""
 
 SLOW_INTERVAL_S = 0.25
 """Interval between slow reads [s], which alternate between the servos' clocks and their voltages and temperatures."""
@@ -78,8 +79,8 @@ class PortConfig(Table):
 class PriorConfig(Table):
     """`[arm.prior]`: best guesses before any identification, one value per joint.
 
-    Missing values are guessed from link lengths and servo models (hil.dry_run.prior), with `rough_spread` in place of
-    `spread`.
+    Values that are not given are guessed from link lengths and servo models (hil.dry_run.prior); `rough_spread` then
+    applies instead of `spread`.
     """
 
     spread: PositiveFloat = Field(0.3, le=1, description="relative standard deviation of each given value")
@@ -117,7 +118,7 @@ class ArmConfig(Table):
 
 
 class SafetyConfig(Table):
-    """`[safety]`: what causes the arm to be stopped, apart from the joint limits, and how it is stopped."""
+    """`[safety]`: conditions other than the joint limits that stop the arm, and how it is stopped."""
 
     watchdog: float = Field(
         0.08, ge=0.02, le=2.54, description="s, time without packets after which a servo stops by itself"
@@ -295,7 +296,7 @@ class Config(Table):
 
     @property
     def rest_tolerance(self) -> float:
-        """Largest deviation from the rest pose at the start [rad]: `arm.rest_tolerance`.
+        """Largest allowed deviation from the rest pose at the start [rad]: `arm.rest_tolerance`.
 
         The default for a spatial arm is LYING_RAD: such an arm lies on a support, and comes to rest closer to
         its rest pose than a hanging arm does.

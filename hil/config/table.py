@@ -21,7 +21,7 @@ def _printable(text: str) -> str:
 
 
 Printable = Annotated[str, AfterValidator(_printable)]
-"""Text without control characters, line breaks or surrogates: it appears in terminals, XML, HTML and CSV."""
+"""Text without control characters, line breaks or surrogates, because it appears in terminals, XML, HTML and CSV."""
 
 BusId = Annotated[int, Field(ge=0, le=252)]
 _One = TypeVar("_One")

@@ -1,7 +1,7 @@
 """Detection of sample rates at which a voltage-driven servo applies its goals with a slowly varying delay.
 
-Such a servo applies a goal when its control loop runs next. If the sample interval is almost a whole number of the
-loop's periods, the delay rises slowly by one period, falls back, and rises again: a slow beat, to which the arm
+Such a servo applies a goal the next time its control loop runs. If the sample interval is almost a whole number of the
+loop's periods, the delay slowly rises by one period, falls back, and rises again. This is a slow beat, to which the arm
 responds. If the sample rate divides the loop's rate, or the beat is much faster than the arm's motion, the delay acts
 like a constant one.
 """

@@ -97,8 +97,8 @@ class ArmJoint:
     fixed: tuple[str, ...]
     """Names of the links attached to this joint's link by fixed or held joints."""
     movable: Mapping[str, Body] = field(default_factory=dict)
-    """Bodies of those links in `fixed` that held joints move, keyed by link name, in the frame of this joint's link. A
-    body does not include the links attached to it.
+    """Bodies of the links in `fixed` that are attached by held joints, keyed by link name, in the frame of this joint's
+    link. Each body excludes the links attached to it.
     """
 
 
@@ -119,7 +119,7 @@ class ArmDescription:
 
     @property
     def parameters(self) -> Array:
-        """Inertial parameters of each link, as in `Body.parameters` (joints, 10)."""
+        """Inertial parameters of each link (joints, 10), in the form of `Body.parameters`."""
         return np.stack([joint.body.parameters for joint in self.joints])
 
     @property
@@ -132,6 +132,6 @@ class ArmDescription:
 
 
 def steiner(offset: Array) -> Array:
-    """Inertia (3, 3) [m^2] that a unit mass at this offset (3,) [m] adds (parallel-axis theorem)."""
+    """Inertia (3, 3) [m^2] added by a unit mass at this offset (3,) [m], by the parallel-axis theorem."""
     shifted: Array = np.dot(offset, offset) * np.eye(3) - np.outer(offset, offset)
     return shifted

@@ -1,4 +1,4 @@
-"""Reads an arm from a URDF or MJCF file; the root element shows which of the two it is."""
+"""Read an arm from a URDF or MJCF file; the root element tells the two formats apart."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The copy of an arm's file in a run folder; it must be readable without the files next to the original."""
+"""The copy of an arm's file in a run folder. The copy must be readable without the files next to the original."""
 
 from pathlib import Path
 
@@ -12,7 +12,8 @@ def kept_bytes(path: Path) -> bytes:
     """Return the bytes to store as the copy of a URDF or MJCF file. Raises OSError, ArmFileError.
 
     A URDF is kept unchanged. MuJoCo cannot read an MJCF whose meshes, textures or included files are missing, so an
-    MJCF that needs other files is made self-contained: included files are inlined; shapes that need a file are removed.
+    MJCF that needs other files is made self-contained: included files are inlined; shapes that need other files are
+    removed.
     """
     if not is_mjcf(path) or not (text := _self_contained(path)):
         return path.read_bytes()

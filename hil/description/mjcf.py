@@ -63,9 +63,9 @@ def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
 class Geom:
     """A shape of an MJCF file, in the frame of its moving link.
 
-    link: its number; 0 for shapes fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh". size: as
-    in MuJoCo, the half edge lengths of a box, or the radius and, except for a sphere, the half length [m]; for a mesh,
-    the half edge lengths of its bounding box. Any other shape is treated as a mesh.
+    link: number of that link; 0 for shapes fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh".
+    size: as in MuJoCo, half the edge lengths of a box, or the radius and, except for a sphere, half the length [m]; for
+    a mesh, half the edge lengths of its bounding box. Any other shape is treated as a mesh.
     """
 
     link: int
@@ -135,8 +135,8 @@ class _Tree:
         return None if (x, y, z) == USUAL_GRAVITY else (x, y, z)
 
     def not_modelled(self, names: list[str], bodies: list[int]) -> Iterator[str]:
-        """Yield one sentence for each kind of force in the file that the model (rigid links with friction) does not
-        include.
+        """Yield one sentence for each kind of force that the file contains but the model (rigid links with friction)
+        does not.
         """
         model = self.model
         sprung = [name for name in names if np.any(model.jnt_stiffness[model.joint(name).id])]
@@ -222,7 +222,7 @@ class _Tree:
         return way
 
     def frame(self, body: int, before: int) -> tuple[Array, Array]:
-        """Rotation and position of a body's joint in the frame of the previous moving body. That frame's origin is the
+        """Rotation and position of a body's joint in the frame of the previous moving body, whose origin is at the
         previous joint.
         """
         rotation, translation = np.eye(3), np.zeros(3)

@@ -1,5 +1,5 @@
-"""The pose of an arm given by its description, and how each joint moves it, in terms that a person can compare with the
-real arm.
+"""The pose of an arm according to its description, and how each joint moves it, in words that a person can compare with
+the real arm.
 """
 
 import numpy as np
@@ -39,8 +39,7 @@ def moves(arm: ArmDescription, angles: Array, joint: int, up: Array | tuple[floa
 
 
 def _towards(vector: Array, up: Array) -> str:
-    """Name the base's axis that is nearest to a vector, and the direction of this axis as seen by an observer next
-    to the arm.
+    """Name the axis of the base nearest to a vector, and say where this axis points for an observer next to the arm.
 
     The observer looks along the base's x axis or, if that is vertical, along its z axis.
     """

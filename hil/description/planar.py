@@ -38,9 +38,7 @@ def _first_link(arm: ArmDescription, offsets: list[Array]) -> Array:
 
 
 def _level(axis: Array, link: Array, down: Array) -> bool:
-    """Whether the component of the vector `link` that is perpendicular to `axis` is horizontal, and a positive
-    rotation lifts it.
-    """
+    """Whether the component of `link` perpendicular to `axis` is horizontal and is lifted by a positive rotation."""
     across = link - axis * float(axis @ link)
     length = float(np.linalg.norm(across))
     if length == 0.0:

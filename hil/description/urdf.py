@@ -1,5 +1,4 @@
-"""Reads from a URDF the branch formed by the arm's joints, with everything that is rigidly attached merged into its
-links.
+"""Read the branch formed by the arm's joints from a URDF. Everything rigidly attached to a link is merged into it.
 
 Format: wiki.ros.org/urdf/XML. Only geometry and inertias are read; meshes are not opened.
 """
@@ -156,7 +155,7 @@ def _body(element: ET.Element | None, where: str, path: Path) -> Body:
 
 
 def _check_shapes(link: ET.Element, where: str, path: Path) -> None:
-    """Raise ArmFileError for an invalid size or origin in a link's collision (otherwise visual) geometry."""
+    """Raise ArmFileError for an invalid size or origin in a link's collision geometry (or visual, if it has none)."""
     for element in link.findall("collision") or link.findall("visual"):
         _origin(element, where, path)
         for shape in element.find("geometry") or ():
@@ -219,7 +218,7 @@ def _root_link(bodies: dict[str, Body], tree: dict[str, _Joint], path: Path) -> 
     children = {joint.child for joint in tree.values()}
     roots = [name for name in bodies if name not in children]
     if not roots:
-        raise ArmFileError(f"{path}: every link is a joint's child, so the links form a loop; one must be the base")
+        raise ArmFileError(f"{path}: every link is a joint's child, so they form a loop; one link must be the base")
     if len(roots) > 1:
         raise ArmFileError(
             f"{path}: links {', '.join(roots)} have no parent joint: only one base link is allowed; attach the others "
@@ -229,7 +228,7 @@ def _root_link(bodies: dict[str, Body], tree: dict[str, _Joint], path: Path) -> 
 
 
 def _all_turning(tree: dict[str, _Joint], base: str, path: Path) -> list[str]:
-    """Names of the rotating joints, provided that they form a single branch."""
+    """Names of the rotating joints. Raises ArmFileError if they do not form a single branch."""
     names: list[str] = []
     link = base
     while True:
@@ -337,7 +336,7 @@ def _own(link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: se
 
 
 def check_units(arm: Sequence[ArmJoint], path: Path) -> None:
-    """Raise ArmFileError if lengths, masses or inertias look like millimetres or grams."""
+    """Raise ArmFileError if lengths, masses or inertias seem to be in millimetres or grams."""
     for joint in arm:
         length = float(np.linalg.norm(joint.translation))
         if length > MOST_LENGTH:

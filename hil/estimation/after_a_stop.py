@@ -12,7 +12,7 @@ from hil.runs.run_folder import RunFolder
 
 
 def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
-    """Sentences about what remains of a stopped run; the last gives the next command.
+    """Sentences about what remains of a stopped run; the last one names the next command.
 
     command: the subcommand that was stopped. shown: the configuration's path as the user wrote it.
     """
@@ -33,7 +33,9 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
 
 
 def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
-    """Sentences about what remains after the guard or a failed servo stopped a run; the last gives the next command."""
+    """Sentences about what remains of a run that the guard or a failed servo stopped; the last one names the next
+    command.
+    """
     if nothing := _nothing_recorded(run, shown):
         return nothing
     if can_be_estimated(run.path):
@@ -42,7 +44,7 @@ def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
 
 
 def _nothing_recorded(run: RunFolder, shown: Path) -> list[str]:
-    """Say that a folder without a recording or result is still there; nothing if it holds either."""
+    """Sentences about a folder without data that could not be removed; [] if it holds a recording or a result."""
     if run.result_path.is_file() or run.samples_path.is_file() or _steps(run.path):
         return []
     return [

@@ -145,7 +145,7 @@ def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
 
 
 def true_chain_parameters(config: Config, known: KnownChain) -> dict[str, float] | None:
-    """True parameters of the fake arm by name [SI]; None for a real arm or another kind of fake arm."""
+    """True parameters of the fake arm by name [SI]; None for a real arm, or for a fake arm that is not spatial."""
     chain = None if config.fake is None else config.fake.chain
     if not config.is_fake or chain is None:
         return None
@@ -197,9 +197,9 @@ def _verdict(
 ) -> Verdict:
     """The verdict, with reasons.
 
-    held_out: relative prediction error on the held-out path (joints,); None without one. still: names of joints that
-    hardly moved. gravity: the direction with which the recording agrees with the description; see `better_gravity`.
-    sticking: joints that stick, from 0.
+    held_out: relative prediction error on the held-out path (joints,); None if no path was held out. still: names of
+    joints that hardly moved. gravity: direction of gravity for which recording and description agree; see
+    `better_gravity`. sticking: joints that stick, numbered from 0.
     """
     joints = [joint.name for joint in config.joints]
     certain = estimate.std[: known.base.count] / known.prior.std

@@ -37,9 +37,9 @@ def mounted_otherwise(
 
     Args:
         arm: the description.
-        opposed: moments that contradict it in sign; may be empty.
+        opposed: moments whose signs contradict the description; may be empty.
         assumed: configured gravity in the base's frame (3,) [m/s^2].
-        gravity: gravity with which they agree, likewise; see `better_gravity`.
+        gravity: gravity for which estimate and description agree, in the same form; see `better_gravity`.
         explained: whether the model explains the motion.
     """
     base, before = mount_angles(gravity), mount_angles(assumed)
@@ -100,7 +100,7 @@ def _on_the_other_side(arm: ArmDescription, opposed: Sequence[Opposed]) -> str:
 
 
 def _mount_said(gravity: Array) -> str:
-    """Describe a mount in words. gravity: along an axis of the base, or in any other direction."""
+    """Describe in words how the base is mounted, given gravity in its frame (3,)."""
     down = gravity / np.linalg.norm(gravity)
     axis = int(np.argmax(np.abs(down)))
     if abs(down[axis]) < 1.0 - 1e-6:

@@ -14,8 +14,8 @@ def wanted_model(
 ) -> Model:
     """The model requested by the file for an arm with `joints` joints; "auto" gives Stribeck friction.
 
-    by_voltage: joints, from 1, that are driven by voltage (`voltage_driven`). lever: length of link 1 divided by
-    gravity (`lever_of`).
+    by_voltage: joints, numbered from 1, that are driven by voltage (`voltage_driven`). lever: length of link 1 divided
+    by gravity (`lever_of`).
     """
     return Model(
         joints,

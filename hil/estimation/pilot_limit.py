@@ -15,7 +15,7 @@ REACHED = 0.5  # if a smaller fraction of every limit was reached, something els
 
 
 def torque_limit(config: Config, samples: NDArray[np.void], index: int | None = None) -> TorqueLimit | None:
-    """The limit that the pilot approached most closely, and the fraction used.
+    """The limit that the pilot approached most closely, and the fraction of it that was reached.
 
     index: the joint whose limits count; None for all joints. Returns None without a pilot, because the user then gave
     peak_torque.

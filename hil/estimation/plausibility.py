@@ -20,9 +20,9 @@ _UPRIGHT = 0.5  # sine of a link's angle above the horizontal
 FLAT = 0.02  # fraction of the largest commanded torque, below which gravity counts as absent
 
 MOSTLY_BORROWED, CLEARLY_WIDER = 0.85, 2.0
-"""Limits on the standard error of link 1's length as it follows from the parameters, relative to the standard error of
-the prior. Above the first, the length comes mainly from the prior; above the second, the prior must have been widened
-(`LEVER_DOUBTED`).
+"""Limits on the standard error of the length of link 1 that follows from the parameters, relative to the standard error
+of the prior. Above the first, the length comes mainly from the prior; above the second, the prior must have been
+widened (`LEVER_DOUBTED`).
 """
 
 

@@ -17,7 +17,7 @@ QUANTISATION_FLOOR_TICKS = 1 / math.sqrt(12)
 
 @dataclass(frozen=True)
 class Checks:
-    """Findings of the checks of an estimate."""
+    """What the checks of an estimate have found."""
 
     validation: Validation
     verdict: Verdict

@@ -82,8 +82,8 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
 
 
 def _passes(position: Array, first: int, on_time: Array) -> tuple[Array, ...]:
-    """Second halves of the settled periods `on_time` (periods, joints, samples) and of the period before them; the
-    first half of the latter may still contain a transient.
+    """Second halves of the settled periods `on_time` (periods, joints, samples) and of the period before them. The
+    first half of that earlier period may still contain a transient.
     """
     half = on_time.shape[2] // 2
     return position[first - 1, :, half:], *on_time[:, :, half:]

@@ -80,7 +80,7 @@ class Truth:
 
 
 def truth_of(result: Result, config: Config) -> Truth:
-    """The truth stored in a result, scaled to the torque constants that the result assumes."""
+    """The true values stored in a result, scaled to the torque constants that the result assumes."""
     return in_file_unit(result.truth or {}, config, result.extra, result.joints)
 
 

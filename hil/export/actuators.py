@@ -1,4 +1,4 @@
-"""Actuators of an MJCF file: controlled by servo goals, with gain, offset and lag."""
+"""Actuators of an MJCF file. They are controlled by servo goals, and have a gain, an offset and a lag."""
 
 from xml.etree import ElementTree as ET
 

@@ -27,7 +27,7 @@ _IN_MJCF = ("offset", "lag", "lag_ratio", *TILT)
 
 
 def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
-    """Write the URDF `path`; return what URDF cannot represent. Raises ExportError."""
+    """Write the URDF file `path`; return what URDF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
     if is_mjcf(found.path):
         return _export_own_urdf(found, model, path)
@@ -97,7 +97,7 @@ def _export_own_urdf(found: ChainLinks, model: ChainArmModel, path: Path) -> lis
 
 
 def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
-    """Write the MJCF `path`; return what MJCF cannot represent. Raises ExportError."""
+    """Write the MJCF file `path`; return what MJCF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
     root = ET.Element("mujoco", model=found.path.stem)
     solids = solids_of(found.arm)
@@ -186,7 +186,7 @@ def _replace_inertial(link: ET.Element, body: Body) -> None:
 
 
 def _scale_inertial(link: ET.Element, share: float) -> None:
-    comment(link, f"{share:g} of the described mass and inertia: the full values would leave none for its parent link")
+    comment(link, f"{share:g} of the described mass and inertia: the full values would leave none for the parent link")
     for element in (*link.findall("inertial/mass"), *link.findall("inertial/inertia")):
         for key, value in element.attrib.items():
             element.set(key, numbers(share * float(value)))

@@ -28,14 +28,16 @@ HALVINGS = 12
 LEAST_LEFT = 0.1  # of a link's mass, after separating what held joints move
 FAR = 3.0  # standard errors between physical links and identified parameters above which a note is added
 DIFFERENT, USELESS = 0.01, 0.2
-"""Relative RMS differences between a joint's torques in the file and those identified, above which a warning is given
-or the export is refused.
+"""Limits on the relative RMS difference between a joint's torques in the file and the identified ones. Above the first,
+a warning is given; above the second, the export is refused.
 """
 LITTLE_PULL = 1e-3
-"""Weight of the description if the usual one draws the torques away from uncertain identified values."""
+"""Weight of the description if the usual weight pulls the torques away from identified values that are uncertain."""
 MOTIONS, SPEED, ACCELERATION = 200, 1.0, 10.0  # random poses; RMS velocity [rad/s] and acceleration [rad/s^2]
 NOT_EXACT = "the identified arm exactly: "
-"""Beginning of the sentence about what a file cannot represent if its arm is not equivalent to the identified one."""
+"""Beginning of the first sentence about what a file cannot represent, if its arm is not equivalent to the identified
+one.
+"""
 
 
 @dataclass(frozen=True)
@@ -94,8 +96,8 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
 
 
 def _torque_difference(model: ChainArmModel, base: BaseParameters, value: Array, found: PhysicalLinks) -> Array:
-    """RMS difference between the torques of the found links and the identified ones, relative to the RMS of the joint's
-    whole torque (joints,). Both are computed in random poses within the position limits.
+    """RMS difference between each joint's torque with the exported links and the identified torque, relative to the RMS
+    of the whole torque (joints,). All torques are computed in random poses within the position limits.
     """
     rng = np.random.default_rng(1)
     limits = np.array([joint.position_limit if joint.has_limits else (-np.pi, np.pi) for joint in model.joints])
@@ -117,15 +119,16 @@ def _by_joint(model: ChainArmModel, different: Array) -> str:
 
 def _refusal(model: ChainArmModel, different: Array) -> str:
     return (
-        "No arm of physically consistent links has the identified values: with the nearest ones, the joints' torques "
-        f"differ by {_by_joint(model, different)}; at most {100.0 * USELESS:.0f} % is exported. Correct what the "
-        "verdict names (base, direction, zero_ticks, the description of the arm) and identify again. The identified "
-        "values themselves can be exported with --format toml or json."
+        "No physically consistent links have the identified values: with the closest ones, the joints' torques differ "
+        f"by {_by_joint(model, different)}; arms that differ by more than {100.0 * USELESS:.0f} % are not exported. "
+        "Correct what the verdict names (base, direction, zero_ticks, the description of the arm) and identify again. "
+        "The identified values themselves can be exported with --format toml or json."
     )
 
 
 def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
-    """Separate a link from the parts that its held joints move, such as gripper fingers, which keep their inertia.
+    """Separate a link from the parts that held joints move, such as gripper fingers; these parts keep their own
+    inertia.
 
     If the described masses of these parts leave no physically possible body for the link itself, the masses are
     multiplied by a common fraction, which is halved until a body is possible. Returns the link's body and that
@@ -143,7 +146,7 @@ def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
 
 
 def _same_groups(base: BaseParameters, groups: Mapping[str, str]) -> bool:
-    """Return whether these groups equal those of the base parameters, apart from rounding of their factors."""
+    """Return whether these groups and those of the base parameters are equal, up to rounding of the factors."""
     if set(groups) != set(base.names):
         return False
     return all(_same_sum(group, groups[name]) for name, group in zip(base.names, base.groups, strict=True))

@@ -22,9 +22,10 @@ S = TypeVar("S", Source, Recorded)
 
 @dataclass(frozen=True)
 class Format(Generic[S]):
-    """One format.
+    """An export format.
 
-    write: writes a file and returns what it cannot represent. file_name: default name in the run folder.
+    write: function that writes a file and returns what the format cannot represent. file_name: default name in the run
+    folder.
     """
 
     write: Callable[[S, Path], list[str]]
@@ -39,7 +40,7 @@ FORMATS: Mapping[str, Format[Source]] = MappingProxyType(
         "json": Format(export_json, "arm.json"),
     }
 )
-"""Formats of an identified arm."""
+"""Formats for an identified arm."""
 
 RECORDING_FORMATS: Mapping[str, Format[Recorded]] = MappingProxyType(
     {
@@ -49,7 +50,7 @@ RECORDING_FORMATS: Mapping[str, Format[Recorded]] = MappingProxyType(
         "mat": Format(export_mat, "samples.mat"),
     }
 )
-"""Formats of a recording; they do not need an estimate."""
+"""Formats for a recording; they need no estimate."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Written:
 
     @property
     def warning(self) -> str:
-        """How far the arm in the file is from the identified one; "" if they are dynamically equivalent."""
+        """How the arm in the file differs from the identified one; "" if they are dynamically equivalent."""
         why = next(iter(self.left_out), "")
         if not why.startswith(NOT_EXACT):
             return ""

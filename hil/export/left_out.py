@@ -9,14 +9,14 @@ from hil.estimator.chain.model.tilt import MEANINGS
 from hil.estimator.models.terms import kind_of, term_of
 
 LEVEL = 1e-6
-"""Horizontal component of gravity in the base's frame, relative to gravity, up to which the base counts as upright."""
+"""The base counts as upright if, in its frame, the horizontal part of gravity is at most this fraction of the whole."""
 
 _SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torque_scale")
 """Terms that need no sentence, because every robot description has them or because `torque_constants` reports them."""
 
 
 def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:
-    """One sentence per model parameter that the format cannot represent. carried: terms that it can represent."""
+    """One sentence per model parameter that the format cannot represent. carried: terms that it does represent."""
     elsewhere = (*_SAID_ELSEWHERE, *carried)
     return [_sentence(name, value) for name, value in model.values.items() if kind_of(name) not in elsewhere]
 
@@ -39,7 +39,7 @@ def base_orientation(model: ChainArmModel) -> list[str]:
     x, y, z = (0.0 + np.round(gravity, 3)).tolist()
     return [
         f"the orientation of the base: in its frame, gravity is ({x:g}, {y:g}, {z:g}) m/s^2. Mount the arm accordingly "
-        "in the simulator, or set its gravity to this"
+        "in the simulator, or set the simulator's gravity to this"
     ]
 
 

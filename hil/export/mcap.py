@@ -1,4 +1,5 @@
-"""MCAP export, for Foxglove and PlotJuggler: one topic per joint, JSON messages with a schema, result.json attached.
+"""MCAP export for Foxglove and PlotJuggler: one topic per joint with JSON messages and their schema; result.json is
+attached.
 
 The topics `/transforms` and `/arm` hold the moving arm's frames and shapes, for a 3D panel.
 """

@@ -1,4 +1,4 @@
-"""MJCF export: bodies with masses, hinges with armature and friction, actuators commanded in the servo's own unit."""
+"""MJCF export: bodies with masses, hinges with armature and friction, and actuators commanded in the servos' units."""
 
 from pathlib import Path
 from xml.etree import ElementTree as ET

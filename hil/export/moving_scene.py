@@ -1,6 +1,6 @@
 """An arm as frames and shapes: where each link is at each sample, and what to draw there.
 
-Used by the MCAP export; Foxglove's 3D panel shows the exported messages `FrameTransforms` and `SceneUpdate`.
+The MCAP export writes both as `FrameTransforms` and `SceneUpdate` messages, which Foxglove's 3D panel shows.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """Arms drawn from the posterior of an identification, for domain randomisation: one file per arm, one table for all.
 
-The parameters are drawn from a normal distribution with the estimated covariance. One factor common to all torques is
-also drawn, because the torque constant is known far less accurately than anything else. The motion reveals the ratios
+The parameters are drawn from a normal distribution with the estimated covariance. A factor common to all torques is
+also drawn, because the torque constants are known far less accurately than anything else. The motion reveals the ratios
 of the joints' constants, so only a common factor remains unknown; its uncertainty is that of the best-known joint's
 constant. The torque per goal (in A or V) is scaled with it, so that all drawn arms respond to the same goals in the
 same way.
@@ -36,7 +36,7 @@ _POSES = 20
 """Number of poses in which the mass matrix of a drawn spatial arm must be positive definite."""
 
 _WITH_TORQUE = ("N", "kg")
-"""Beginnings of the units of parameters that scale with the torque constant: torques, masses and their moments."""
+"""First letters of the units of parameters that scale with the torque constant: torques, masses and their moments."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def _posterior(source: Source) -> tuple[tuple[str, ...], Array, Array]:
 
 
 def _root(covariance: Array) -> Array:
-    """A matrix A with A A^T = covariance, which may be singular."""
+    """A matrix A with A A^T = covariance. The covariance may be singular."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     safe = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
@@ -160,8 +160,8 @@ def _matched(rng: np.random.Generator, samples: int, count: int) -> Array:
 def _physical(
     source: Source, names: tuple[str, ...], mean: Array, covariance: Array, values: Array, rng: np.random.Generator
 ) -> tuple[Array, int]:
-    """Redraw every arm with negative inertia or friction, or without physically possible masses; return the draws and
-    how many were replaced.
+    """Redraw every arm that has a negative inertia or friction, or no physically possible masses. Return the draws and
+    the number of arms replaced.
     """
     root, redrawn = _root(covariance), 0
     for _ in range(_TRIES):
@@ -227,7 +227,7 @@ def _write_table(source: Source, drawn: Drawn, path: Path) -> None:
 
 
 def _actuator(drawn: Drawn, joint: int) -> dict[str, tuple[Array, str]]:
-    """Actuator properties of each drawn arm (samples,) with their units, under the names of Isaac Lab."""
+    """Actuator properties of each drawn arm (samples,) and their units, named as in Isaac Lab."""
     facts = drawn.models[0].joints[joint - 1]
 
     def column(name: str) -> Array:

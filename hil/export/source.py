@@ -21,7 +21,7 @@ __all__ = ["MissingPackages", "Recorded", "Source", "write_text"]
 
 
 class MissingPackages(ExportError):
-    """Packages that some formats need are not installed. needs: one clause per format, saying what it needs."""
+    """Packages needed for some formats are not installed. needs: one clause per format that names its package."""
 
     def __init__(self, *needs: str) -> None:
         super().__init__(f"{', '.join(needs)}: pip install 'hil[export]'.")

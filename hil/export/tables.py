@@ -13,7 +13,7 @@ from hil.model_file import model_of
 
 
 def export_csv(source: Recorded, path: Path) -> list[str]:
-    """Write `path` at full precision; missing values are written as nan."""
+    """Write the CSV file `path` at full precision; missing values are written as nan."""
     table = columns(source)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -27,7 +27,7 @@ def export_csv(source: Recorded, path: Path) -> list[str]:
 
 
 def export_parquet(source: Recorded, path: Path) -> list[str]:
-    """Write `path`; its metadata contains the columns' units and result.json. Needs pyarrow."""
+    """Write the Parquet file `path`; its metadata holds the columns' units and result.json. Needs pyarrow."""
     try:
         import pyarrow as pa
         from pyarrow import parquet
@@ -47,7 +47,9 @@ def export_parquet(source: Recorded, path: Path) -> list[str]:
 
 
 def export_mat(source: Recorded, path: Path) -> list[str]:
-    """Write `path` for MATLAB and Octave: structs `samples`, `units`, `parameters`, `std`, and result.json as text."""
+    """Write the MAT file `path` for MATLAB and Octave: structs `samples`, `units`, `parameters` and `std`, and
+    result.json as text.
+    """
     from scipy.io import savemat
 
     table = columns(source)

@@ -1,4 +1,4 @@
-"""URDF export: links with masses, joints with limits, viscous and Coulomb friction."""
+"""URDF export: links with masses, and joints with limits, viscous friction and Coulomb friction."""
 
 from pathlib import Path
 from xml.etree import ElementTree as ET

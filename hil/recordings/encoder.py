@@ -29,7 +29,9 @@ def encoder_step(position: Array) -> float | None:
 
 
 def _refined(away: Array, step: float) -> float | None:
-    """Refine a step by regression on integers, from near to far readings; None if too few are whole steps apart."""
+    """Refine a step by regression on whole numbers of steps, first with nearby readings, finally with all; None if too
+    few readings are whole steps apart.
+    """
     reach = 20.0 * step
     while True:
         near = away <= reach

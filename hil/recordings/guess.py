@@ -74,7 +74,7 @@ def said(columns: Columns, table: Table) -> str:
 
 
 def _described(kind: str, names: Sequence[str], columns: Columns, table: Table) -> str:
-    """The columns' names; if the header states no unit, with the configured or the assumed one."""
+    """The columns' names for a message, with the configured unit or, if the header states none, the assumed unit."""
     given = getattr(columns, f"{kind}_unit", None)
     if given is not None:
         return f"{', '.join(names)} [{given}]"
@@ -92,7 +92,9 @@ def _time(table: Table) -> str:
 
 
 def _group(table: Table, kind: str, columns: Columns, needed: bool = True) -> list[str] | None:
-    """Find the columns of one kind, one per joint; if unclear, return None, or raise CsvError if they are needed."""
+    """Find the columns of one kind, one per joint; None if there are none. Raises CsvError if several sets of columns
+    are possible, or if the columns are needed but missing.
+    """
     named: dict[str, list[str]] = defaultdict(list)
     for name in table.columns:
         bare, unit = split_head(name)
@@ -130,12 +132,14 @@ def _last(name: str) -> str:
 
 
 def _spaced(name: str) -> str:
-    """Split names such as `pos_meas1` and `observation.state.0` into words, for searching."""
+    """Split names such as `pos_meas1` and `observation.state.0` into words that can be searched for."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])|[_./\[\]\-]+", " ", name)
 
 
 def _stem(name: str) -> str:
-    """A column's name without its number or, failing that, without its last dotted part or a joint's name."""
+    """The part of a name that is common to the columns of one kind: the name without its number or, if it has none,
+    without its last dotted part or the name of a joint.
+    """
     numbered = re.sub(r"\d+", "#", name)
     if numbered != name:
         return numbered
@@ -161,7 +165,9 @@ def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
 
 
 def _example(table: Table) -> str:
-    """A `[columns]` table with this file's own names: those that are recognised, then the others in the usual order."""
+    """A `[columns]` table with this file's own column names. Names that are not recognised are assumed to be in the
+    usual order.
+    """
     words = {split_head(name)[0]: _spaced(split_head(name)[0]) for name in table.columns}
     kinds = {name: _kind(name, spaced) for name, spaced in words.items()}
     time = next((name for name, kind in kinds.items() if kind == "time"), None)
@@ -196,7 +202,9 @@ def _kind(name: str, words: str) -> str:
 
 
 def _first_group(kinds: Mapping[str, str], wanted: str) -> list[str]:
-    """The first columns of a kind that differ only in the joint's number; none if there are too many."""
+    """The first set of columns of a kind whose names differ only in the joint's number; sets that are too large are
+    skipped.
+    """
     groups: dict[str, list[str]] = defaultdict(list)
     for name, kind in kinds.items():
         if kind == wanted:

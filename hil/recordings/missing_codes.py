@@ -11,7 +11,7 @@ CODES = tuple(
 
 FEWEST = 2
 APART = 2.0
-"""Minimum distance between a code and all other values, relative to the range of the latter."""
+"""Minimum distance between a code and all other values, relative to the range of those values."""
 
 
 def without_codes(values: Array) -> tuple[Array, float | None]:

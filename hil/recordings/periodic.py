@@ -49,7 +49,9 @@ def mean_period(recording: Recording) -> MeanPeriod | None:
 
 
 def _period(torque: Array) -> int | None:
-    """Period of the torque (joints, samples) in samples, with at least two repetitions; None if it is not periodic."""
+    """Period, in samples, of the torque (joints, samples), which must hold at least two periods; None if it is not
+    periodic.
+    """
     moved = torque - torque.mean(axis=1, keepdims=True)
     samples = moved.shape[1]
     power = float(np.mean(moved**2))

@@ -1,4 +1,4 @@
-"""Rejection of angles, torques, currents and voltages that no servo arm reaches, which usually lack a stated unit.
+"""Rejection of angles, torques, currents and voltages that no servo arm reaches. Usually, their columns state no unit.
 
 Joints that rotate continuously are accepted, and so is everything if [columns] states the unit. A torque, current or
 voltage is also accepted if its column states the unit.
@@ -88,7 +88,7 @@ def refuse_thousandths(source: str, name: str, kind: str, values: Array) -> None
 
 
 def _are_ticks(values: Array) -> bool:
-    """Whether these look like the register of a servo: whole numbers, too large for degrees."""
+    """Whether the values look like those of a servo's register: whole numbers that are too large for degrees."""
     return bool(np.all(values == np.round(values)) and np.abs(values).max() > _MOST_DEGREES)
 
 

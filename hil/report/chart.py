@@ -44,7 +44,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Matrix:
-    """A square matrix of values from -1 to 1 with the same labels on both axes; NaN is left blank."""
+    """A square matrix of values from -1 to 1, with the same labels on both axes. NaN cells are left blank."""
 
     name: str
     title: str
@@ -56,7 +56,7 @@ Figure = Chart | Matrix
 
 
 def thin(x: Array, y: Array, most: int) -> tuple[Array, Array]:
-    """Reduce a curve to about `most` points: the lowest and the highest point of each group, in order."""
+    """Reduce a curve to about `most` points: the lowest and highest of each group of successive points, in order."""
     if len(x) <= most:
         return x, y
     count = len(x) // (most // 2)

@@ -33,8 +33,8 @@ from hil.report.svg import NARROW, WIDE, draw_svg
 
 FILE_NAME = "report.html"
 MOST_POINTS = 70_000
-"""Largest total number of points in all curves of a page, counted in the wide versions of the figures: twice as many as
-on a planar arm's page.
+"""Largest total number of points in all curves of a page, counted in the wide versions of the figures. The page of a
+planar arm has half as many.
 """
 FEWEST_POINTS = 600
 _CODE = re.compile("`([^`]+)`")
@@ -112,7 +112,7 @@ def figures_in(shown: Sequence[Section]) -> list[Figure]:
 
 
 def _share_of_points(shown: Sequence[Section]) -> float:
-    """Fraction of its points that each curve keeps, so that a page with many joints stays small."""
+    """Fraction of its points that each curve keeps. It is reduced so that a page with many joints stays small."""
     charts = [figure for figure in figures_in(shown) if isinstance(figure, Chart)]
     wanted = sum(min(len(series.x), WIDE.points) for chart in charts for series in chart.series)
     return min(1.0, MOST_POINTS / max(1, wanted))

@@ -32,7 +32,7 @@ class _Shown:
 
 
 def write_recording_report(folder: Path, out: Path | None = None) -> Path:
-    """Write the report on a recording folder, by default in that folder, and return the report's path.
+    """Write the report on a recording folder, by default into that folder. Return the report's path.
 
     Raises RunFolderError, ResultError.
     """

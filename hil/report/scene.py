@@ -15,7 +15,7 @@ from hil.report.section import Motion, SpatialMotion
 
 MOST_FRAMES = 600
 FEW_POSES = 60
-"""Number of poses from which the size of the picture is determined."""
+"""Number of poses used to determine the size of the picture."""
 MOST_SHOWN_M = 1.0
 """Larger clearances are shown as this value [m]."""
 
@@ -38,8 +38,8 @@ def spatial_motion(
 ) -> SpatialMotion:
     """The motion (joints, samples) [rad] of a configured spatial arm.
 
-    ways: numbers of samples at the beginning and at the end during which the arm moves from and to the rest pose;
-    there, distances below the margin are allowed. Raises ConfigError, ArmFileError.
+    ways: numbers of samples at the beginning, while the arm leaves the rest pose, and at the end, while it returns to
+    it; in those samples, clearances below the margin are allowed. Raises ConfigError, ArmFileError.
     """
     space = Space.of(config)
     step = _frame_step(position)

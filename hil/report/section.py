@@ -64,7 +64,7 @@ class SpatialMotion:
 
 @dataclass(frozen=True)
 class Section:
-    """One section: text, tables, figures, then folded text. `tone` sets the colour of the verdict."""
+    """One section: text, tables, figures, then collapsed text. `tone` sets the colour of the verdict."""
 
     key: str
     title: str

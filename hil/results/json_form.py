@@ -71,7 +71,7 @@ def _read(kind: Any, value: Any, where: str) -> Any:
     if origin in (tuple, Sequence):
         entries = _checked(value, list, where)
         if len(arguments) > 1 and arguments[-1] is not ... and len(entries) != len(arguments):
-            raise FormError(f"has {len(entries)} entries instead of {len(arguments)} as {where!r}")
+            raise FormError(f"has {len(entries)} entries instead of {len(arguments)} in {where!r}")
         return tuple(_read(arguments[0], entry, f"{where}[{index}]") for index, entry in enumerate(entries))
     if origin is not None and issubclass(origin, Mapping):
         table = _checked(value, dict, where)

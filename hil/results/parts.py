@@ -140,20 +140,20 @@ class LineLevels:
 
     @property
     def groups(self) -> dict[str, LineGroup]:
-        """The groups of spectral lines that are available, by kind."""
+        """The available groups of spectral lines, by kind."""
         kinds = {"excited": self.excited, "odd": self.odd, "even": self.even, "other": self.other}
         return {kind: group for kind, group in kinds.items() if group is not None}
 
 
 @dataclass(frozen=True)
 class Validation:
-    """How well the model predicts, per joint; None for what was not checked.
+    """How well the model predicts the motion, per joint. Quantities that were not checked are None.
 
     held_out_rms: open-loop prediction error of a held-out multisine, encoder noise included, relative to the motion's
     RMS (the verdict excludes the noise); if friction has changed since the fitted multisine, the model's friction is
-    scaled by one factor per joint, estimated from the held-out motion itself. held_out_as_fitted_rms: the same with
-    friction as it was in the fitted multisine; None if it has not changed. free_run_rms: open-loop prediction error of
-    the fitted multisine, also relative to the motion's RMS.
+    scaled by one factor per joint, estimated from the held-out motion itself. held_out_as_fitted_rms: the same error
+    with the friction of the fitted multisine; None if friction has not changed. free_run_rms: open-loop prediction
+    error of the fitted multisine, also relative to the motion's RMS.
     residual_over_floor: residual relative to the measured noise, which is at least the rounding noise. correlated_lags:
     fraction of the residual's autocorrelations that exceed those of white noise. condition: condition number of the
     scaled information matrix.
@@ -175,7 +175,7 @@ class Verdict:
     """The verdict on a result.
 
     trust: "yes", "with care" or "no". weakest: the least certain parameter. sentences: the reasons. first: what to
-    correct or check before using the result; None if nothing.
+    correct or check before using the result; None if there is nothing to do.
     """
 
     trust: str
@@ -186,7 +186,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class TriedModel:
-    """One of the friction models that were tried. held_out_rms and score are None if it could not be evaluated."""
+    """One of the friction models that were tried. If it could not be evaluated, held_out_rms and score are None."""
 
     model: str
     parameters: int
@@ -200,7 +200,7 @@ class ModelChoice:
     """The model chosen with friction = "auto", and its benefit and cost.
 
     error_divided_by: prediction error of the model with the fewest parameters divided by that of the chosen one.
-    standard_errors_times: factor by which the standard errors grew; None if they were not compared.
+    standard_errors_times: factor by which the standard errors grew; None if standard errors were not compared.
     """
 
     chosen: str

@@ -15,7 +15,7 @@ arm          data needed to use the model: gravity, rest pose, and, for each joi
              per goal [N m/A, or N m/V in pwm mode]
 chain        only for a spatial arm: its geometry, and the combination that each base parameter represents
 truth        only on a fake arm: the base parameters it was built with, for the true torque constants of its motors
-truth_scaled `truth` scaled to the file's torque constants, like `parameters`; only if the motors' constants differ
+truth_scaled `truth` scaled to the torque constants in the file, as `parameters` are; only if the motors' own differ
 physical     masses, centres and inertias, if [known] gives any quantity
 stabiliser   with a stabiliser: its contribution to the torque
 steps        with a pilot: predicted and measured peaks of each step

@@ -67,7 +67,7 @@ def find_runs(folder: str | PathLike[str]) -> list[RunSummary]:
 
 
 def summarise(path: Path) -> RunSummary:
-    """Summarise one run folder; damaged files are mentioned in the summary and do not raise an exception."""
+    """Summarise one run folder. Damaged files do not raise an exception; the summary mentions them."""
     facts = _facts(path)
     arm = Path(str(facts.get("config", ""))).stem or path.name
     verdict, residual = _outcome(path)

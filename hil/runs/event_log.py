@@ -1,4 +1,4 @@
-"""The events of a run, written by a separate thread, so that a slow disk cannot delay the control loop."""
+"""The events of a run. A separate thread writes them, so that a slow disk cannot delay the control loop."""
 
 import json
 import os
@@ -18,8 +18,8 @@ LATE_NAME = "events-late.jsonl"
 class EventLog:
     """Events of one run.
 
-    On exit it waits briefly for all events to be written. Events that could not be written in time, because
-    events.jsonl blocks, go to events-late.jsonl.
+    On exit, the log waits briefly for all events to be written. If events.jsonl blocks, the events that could not be
+    written in time go to events-late.jsonl.
     """
 
     def __init__(self, run: RunFolder) -> None:

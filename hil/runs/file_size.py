@@ -12,7 +12,7 @@ import numpy as np
 from hil.errors import RunFolderError
 
 MOST_ARCHIVE_BYTES = 512 * 2**20
-"""Largest total size of the arrays in a period.npz [bytes]: enough for hours of samples at 4 kHz."""
+"""Largest allowed total size of the arrays in a period.npz [bytes]: enough for hours of samples at 4 kHz."""
 
 MOST_CSV_BYTES = 1024 * 2**20
 

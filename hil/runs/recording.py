@@ -150,7 +150,8 @@ class Recorder:
         """Truncate the file to the recorded rows; may be called repeatedly.
 
         Raises RunFolderError if this fails. If the file was removed or renamed in the meantime, its rows are first
-        saved in a new file, with the configuration and the other files that were there when the recording began.
+        saved in a new file, together with the configuration and other files that were next to it when the recording
+        began.
         """
         if self._bytes.nbytes == 0:
             return
@@ -258,7 +259,7 @@ def missed(goal_current: Sequence[float], now: float) -> State:
 
 
 def load_samples(path: Path, joints: int) -> NDArray[np.void]:
-    """The recorded rows of a `samples.npy`, even if the process that wrote it was killed. Raises RunFolderError."""
+    """The recorded rows of a `samples.npy`, which may come from a process that was killed. Raises RunFolderError."""
     try:
         check_array(path)
         samples = np.load(path, allow_pickle=False, mmap_mode="r")

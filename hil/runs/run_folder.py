@@ -120,7 +120,7 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._written: list[Path] = []
-        """Files without which the recording could not be used, written before it begins."""
+        """Files written before the recording begins; without them, it could not be used."""
 
     @classmethod
     def create(cls, path: Path, config: Config) -> "RunFolder":
@@ -145,7 +145,8 @@ class RunFolder:
     def refuse_lost(self) -> None:
         """Raise RunFolderError if the folder has been removed, renamed or emptied since it was created.
 
-        Servo settings and facts of the run are written to a new folder of that name, which lacks the configuration.
+        If servo settings or facts of the run have been written in the meantime, the folder exists again, but lacks the
+        configuration.
         """
         if gone := [each.name for each in self._written if not each.is_file()]:
             lost = RunFolderError(
@@ -202,7 +203,7 @@ class RunFolder:
         return self.path / "config.toml"
 
     def own_files(self) -> frozenset[str]:
-        """Names of the files that make up the run: those of the run, of an estimate and of the arm's description."""
+        """Names of all files that belong to the run, including those of its estimate and of the arm's description."""
         own = _OF_A_START | {"result.json", "lateness.json", "recordings.npz"}
         with suppress(RunFolderError, ConfigError):
             own |= {urdf.name for urdf in _urdfs(self.load_config())}
@@ -245,9 +246,7 @@ class RunFolder:
             if self.rest_pose_path.is_file():
                 played["arm"] = ArmConfig(**{**config.arm.model_dump(), **_read_json(self.rest_pose_path)})
         except ValidationError as error:
-            raise RunFolderError(
-                f"The record of the excitation next to {self.config_path} is damaged: {error}."
-            ) from error
+            raise RunFolderError(f"The excitation stored next to {self.config_path} is damaged: {error}.") from error
         return config.model_copy(update=played)
 
     def below(self, name: str, played: Config) -> "RunFolder":
@@ -377,14 +376,14 @@ class RunFolder:
 
 
 def _urdfs(config: Config) -> set[Path]:
-    """URDF files that the configuration names; a copy of the configuration finds them in its own folder."""
+    """URDF files that the configuration names. A copy of the configuration expects them in its own folder."""
     chain = None if config.fake is None else config.fake.chain
     named = [config.arm.urdf, None if chain is None else chain.urdf]
     return {Path(each) for each in named if each is not None}
 
 
 def _has_samples(path: Path) -> bool:
-    """Whether anything was recorded in the file; true if it cannot be read."""
+    """Whether the file holds any recorded sample; also true if the file cannot be read."""
     from hil.runs.recording import Phase
 
     try:
@@ -396,7 +395,9 @@ def _has_samples(path: Path) -> bool:
 
 @cache
 def _versions() -> dict[str, str]:
-    """Return the versions of the packages that a result depends on; reading them takes as long as 100 bus exchanges."""
+    """Return the versions of the packages that a result depends on. Reading the versions takes as long as 100 bus
+    exchanges.
+    """
     return {name: version(name) for name in _PACKAGES}
 
 

@@ -12,7 +12,7 @@ SERVO_CLOCK_WRAP_S = 32.768
 """Period after which the servos' Realtime Tick wraps [s]: it counts milliseconds from 0 to 32767."""
 
 LOST_SHARE = 0.005
-"""The summary of a run names a joint if more than this fraction of the joint's samples was lost."""
+"""The summary of a run names a joint if more than this fraction of its samples were lost."""
 
 _FEWEST_READINGS = 5
 _EDGES_US = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5, 1e6)
@@ -39,7 +39,9 @@ def timing(samples: NDArray[np.void], rate: float) -> StreamTiming:
 
 
 def lateness_histogram(samples: NDArray[np.void]) -> dict[str, list[float]]:
-    """Histogram of lateness: `counts[i]` writes between `edges_us[i]` and `edges_us[i + 1]`; the last bin is open."""
+    """Histogram of lateness: `counts[i]` is the number of writes between `edges_us[i]` and `edges_us[i + 1]`. The last
+    bin has no upper edge.
+    """
     counts, _ = np.histogram(_lateness_us(_sent(samples)), [*_EDGES_US, np.inf])
     return {"edges_us": list(_EDGES_US), "counts": counts.tolist()}
 

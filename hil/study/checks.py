@@ -1,4 +1,4 @@
-"""Checks of a study before anything runs."""
+"""Checks performed on a study before anything runs."""
 
 import shutil
 from pathlib import Path
@@ -16,7 +16,9 @@ BYTES_A_ROW = 4_000
 _SAMPLE_BYTES = 256
 _REPORT_BYTES = 1_500_000
 _LOOKED_AT = 32
-"""Number of runs, spread over the study, whose values are inserted into the arm's file and checked."""
+"""Number of runs that are checked in advance by inserting their values into the arm's file; they are spread over the
+study.
+"""
 
 
 def check_study(study: Study, out: Path) -> int:

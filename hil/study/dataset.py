@@ -49,7 +49,7 @@ class Dataset:
         return found
 
     def table(self) -> pa.Table:
-        """All rows in the order of their runs; columns missing in a part are null there."""
+        """All rows in the order of their runs. Columns that a part lacks are null in its rows."""
         parts = [_read(path) for path in self._parts()]
         if not parts:
             return pa.table({"run": pa.array([], pa.int64())})

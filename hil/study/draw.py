@@ -88,8 +88,8 @@ def arm_path(study: Study) -> Path:
 def put(values: dict[str, Any], key: str, value: Scalar) -> None:
     """Set `key`, such as "fake.arm.drives.0.coulomb", in `values`. Raises KeyError with the missing part of the key.
 
-    A missing table is created; the arm's own check validates its names. A missing list entry is created only if the
-    file lacks the whole list: "fake.faults.0.kind" creates the first fault.
+    A missing table is created; its names are validated later, when the arm is checked. A missing list entry is created
+    only if the file lacks the whole list: "fake.faults.0.kind" creates the first fault.
     """
     *parents, last = key.split(".")
     place: Any = values
@@ -131,7 +131,7 @@ def recordings(study: Study) -> list[Path]:
 
 
 def _recorded(folder: Path) -> Iterator[Path]:
-    """Yield run folders; the steps of a pilot inside one are not separate runs."""
+    """Yield run folders. The steps of a pilot inside a run folder do not count as separate runs."""
     if (folder / "samples.npy").is_file() and (folder / "config.toml").is_file():
         yield folder
         return

@@ -40,8 +40,8 @@ _PACKAGES = ("numpy", "scipy", "numba", "distributed")
 _NO_DASK = "hil study needs Dask: pip install 'hil[study]'."
 _CONNECT_S = 10.0
 _MOST_DEATHS = 10
-"""Number of worker losses after which a run counts as failed, since a run that needs too much memory kills every worker
-that attempts it.
+"""Number of worker losses after which a run counts as failed. A run that needs too much memory kills every worker that
+attempts it.
 """
 
 
@@ -81,7 +81,7 @@ def _silence() -> None:
 
 @contextmanager
 def _cluster(engine: EngineTable, scheduler: str | None, count: int) -> Iterator[Any]:
-    """Start or find a cluster; yield what a client connects to, then close whatever was started here."""
+    """Start or find a cluster and yield what a client connects to; afterwards, close whatever was started here."""
     memory = f"{engine.worker_memory_gib:g}GiB"
     if scheduler is None:
         with _local(count, memory) as cluster:
@@ -133,8 +133,8 @@ def executor(scheduler: str | None = None, count: int | None = None) -> Iterator
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that affects numerical results, in this process, or in a worker if Dask runs this function
-    there.
+    """Versions of everything that affects numerical results, as installed where this function runs: here, or on a Dask
+    worker.
     """
     return {"hil": __version__, **_package_versions()}
 

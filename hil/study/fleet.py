@@ -19,7 +19,9 @@ Floats = np.ndarray[tuple[int], np.dtype[np.float64]]
 
 @dataclass(frozen=True)
 class FleetSpread:
-    """One parameter over the fleet: median and robust standard deviation (1.4826 median absolute deviations) [SI]."""
+    """One parameter over the fleet: median and robust standard deviation (1.4826 times the median absolute deviation)
+    [SI].
+    """
 
     name: str
     median: float
@@ -54,7 +56,7 @@ class FleetArm:
 class Fleet:
     """Comparison of the arms of one type.
 
-    unlike: outliers, the largest first. This and `spreads` are empty for too few arms.
+    unlike: outliers, the largest first. With too few arms, `unlike` and `spreads` are empty.
     """
 
     type: str

@@ -19,11 +19,10 @@ def inject(arm: Path, folder: Path) -> dict[str, Any]:
     """Run the experiment of `arm`, during which its [[fake.faults]] occur.
 
     Returns:
-        `fault.outcome`: "finished", "stopped" (by the guard), or "failed" (ended by the experiment or the bus);
-        `cause` and `message`, as reported; `torque_off_confirmed`, whether all servos confirmed that
-        their torque is off;
-        `samples`; `stopped_after_s`, the time from the first fault to the last sample on the arm's clock;
-        `beyond_limit_rad`, the farthest that a joint moved beyond its limits.
+        `fault.outcome`: "finished", "stopped" (by the guard), or "failed" (ended by the experiment or the bus); `cause`
+        and `message`, as reported; `torque_off_confirmed`, whether all servos confirmed that their torque is off;
+        `samples`, the number of samples; `stopped_after_s`, the time from the first fault to the last sample on the
+        arm's clock; `beyond_limit_rad`, the farthest that a joint moved beyond its limits.
     """
     config = load_config(arm)
     run = RunFolder.create(folder, config)

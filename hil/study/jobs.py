@@ -28,8 +28,8 @@ memory use.
 
 
 _TASK_S, _MOST_IN_A_TASK = 0.1, 50
-"""Largest duration of a task [s] and its largest number of jobs; jobs are combined because each task has an overhead of
-a few ms.
+"""Target duration of a task [s] and largest number of jobs in it. Jobs are combined because each task has an overhead
+of a few ms.
 """
 
 
@@ -39,7 +39,7 @@ _COUNTED_EVERY_S = 1.0
 
 @dataclass(frozen=True)
 class Ended(Generic[Item, Result]):
-    """A job that has ended: with a result, or with the error that it raised or that killed its workers."""
+    """A job that has ended with a result or an error: an exception that it raised, or the loss of its workers."""
 
     number: int
     item: Item
@@ -96,8 +96,9 @@ class _Flight(Generic[Item, Result]):
 
     @property
     def room(self) -> int:
-        """Number of further tasks that can be in flight. Workers can join at any time; they get tasks once they have
-        been counted."""
+        """Number of further tasks that may be submitted. Workers can join at any time; they get tasks once they have
+        been counted.
+        """
         if time.monotonic() - self._counted > _COUNTED_EVERY_S:
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
             self._window, self._counted = max(1, len(workers)) * (1 + _AHEAD), time.monotonic()

@@ -1,4 +1,4 @@
-"""Run a study: send specifications to the workers and write the returned rows to the dataset."""
+"""Run a study: send the specification of each run to a worker, and write the returned rows to the dataset."""
 
 import time
 from collections.abc import Callable, Iterator

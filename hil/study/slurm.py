@@ -67,7 +67,7 @@ def slurm_cluster(count: int, memory: str, environment: Mapping[str, str]) -> It
 
 
 def _wait_for_answer(answers: list[str | None]) -> None:
-    """Wait until the queue has answered the first submission; raises ConfigError if it refused."""
+    """Wait for the queue's answer to the first submission. Raises ConfigError if the queue rejected it."""
     until = time.monotonic() + _ANSWERED_WITHIN_S
     while not answers and time.monotonic() < until:
         time.sleep(_EVERY_S)

@@ -1,4 +1,4 @@
-"""One run of a study, done by a worker: turns a specification into one flat row, even if the run fails."""
+"""One run of a study, performed by a worker: turns a specification into one flat row, even if the run fails."""
 
 import ctypes
 import io
@@ -30,7 +30,7 @@ TIMINGS = ("seconds", "cpu_seconds", "worker")
 _STATE = "XDG_STATE_HOME"
 
 _ONE_AT_A_TIME = threading.Lock()
-"""A worker that was started with several threads still does one run at a time: settings apply to the whole process."""
+"""Even a worker with several threads performs one run at a time, because settings apply to the whole process."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Spec:
 
 
 class WrongVersions(Exception):
-    """A worker that joined later has package versions other than those with which the study was started."""
+    """A worker that joined later has different package versions from those with which the study was started."""
 
 
 class OutOfTime(Exception):
@@ -63,7 +63,7 @@ class OutOfTime(Exception):
 
 
 def work(spec: Spec) -> Row:
-    """Do one run and return its row. Raises only KeyboardInterrupt and SystemExit."""
+    """Perform one run and return its row. Raises only KeyboardInterrupt and SystemExit."""
     with _ONE_AT_A_TIME:
         row = _row_of(spec)
         began, used = time.perf_counter(), time.process_time()
@@ -111,7 +111,7 @@ def _check_versions(spec: Spec) -> None:
 def _at_most(seconds: float) -> Iterator[None]:
     """Raise OutOfTime in this thread once the process has used this much processor time.
 
-    No signal is used, because runs are not done in a worker's main thread. Compiled code is not interrupted.
+    No signal is used, because a worker does not perform runs in its main thread. Compiled code is not interrupted.
     """
     runner, over, limit = threading.get_ident(), threading.Event(), time.process_time() + seconds
 
@@ -154,7 +154,7 @@ def _kept(name: str, columns: tuple[str, ...]) -> bool:
 
 
 def _result(spec: Spec, folder: Path) -> Row:
-    """The requested columns; raises whatever the run raises, with its folder's name removed from the message."""
+    """Return the requested columns. Raises whatever the run raises, with the folder's name removed from the message."""
     try:
         result = dict(flat(_done(spec, folder)))
     except Exception as error:
@@ -164,7 +164,7 @@ def _result(spec: Spec, folder: Path) -> Row:
 
 
 def _without(folder: Path, value: Any) -> Any:
-    """Remove the folder's path from text, so that rows do not depend on where a worker did the run."""
+    """Remove the folder's path from text, so that rows do not depend on where a worker performed the run."""
     return value.replace(f"{folder}/", "") if isinstance(value, str) else value
 
 

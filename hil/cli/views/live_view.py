@@ -19,8 +19,8 @@ _VALUE, _LIMITS, _HEALTH = 7, 12, 14  # widths [columns]: a value, a gauge's two
 
 @dataclass(frozen=True)
 class Layout:
-    """The parts of the display that fit the terminal. gauge: width of a gauge in columns; gauges: how many of the two
-    quantities, position and goal, have a gauge.
+    """The parts of the display that fit the terminal. gauge: width of a gauge in columns. gauges: 2 if position and
+    goal have a gauge, 1 if only the position has one, or 0.
     """
 
     gauge: int

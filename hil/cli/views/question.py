@@ -9,7 +9,7 @@ _T = TypeVar("_T")
 
 
 def answer(question: str, usual: str) -> str:
-    """Return the answer to a question, or `usual` if it is empty. Raises BadParameter if nobody can answer."""
+    """Return the answer to a question, or `usual` if the answer is empty. Raises BadParameter if nobody can answer."""
     asked: str = _put(
         lambda: typer.prompt(question, default=usual, show_default=bool(usual), err=True),
         "Add --yes to accept every default.",

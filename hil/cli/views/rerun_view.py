@@ -60,7 +60,7 @@ def _open(recording: Any, place: str) -> None:
 
 
 class _View:
-    """Logs progress reports to a recording; time continues from one run of a pilot to the next."""
+    """Logs progress reports to a recording. The time axis continues from one run of a pilot to the next."""
 
     def __init__(self, rerun: ModuleType, recording: Any, config: Config) -> None:
         self._rerun, self._recording = rerun, recording
@@ -104,7 +104,7 @@ class _View:
 
 
 def _corners(lengths: list[float], angles: tuple[float, ...]) -> list[tuple[float, float]]:
-    """Corners of a planar arm, from the base to the tip [m]; the vertical axis of a 2D view points down."""
+    """Corners of a planar arm, from the base to the tip [m]. y is negated, because it points down in a 2D view."""
     corners = [(0.0, 0.0)]
     for length, angle in zip(lengths, accumulate(angles), strict=False):
         x, y = corners[-1]

@@ -17,7 +17,7 @@ from hil.results.parts import Quantity
 from hil.results.result import Result, SettledResult, ShootingResult
 
 _NOTHING = 0.01
-"""A true value below this fraction of a standard error is practically 0; its relative error would be meaningless."""
+"""A true value below this fraction of a standard error is practically 0, and a relative error would be meaningless."""
 
 _MOST_NAMED = 3
 """If more models than this were tried, the output gives their number instead of their names."""
@@ -189,9 +189,9 @@ def _next(result: SettledResult, run: Path) -> list[str]:
 
 
 def what_next(result: Result, run: Path) -> str:
-    """Return the line that names the next command: `hil export`; if the verdict is "no", `hil check` or, for recordings
-    made with other tools, `hil estimate`. If the verdict asks for something to be corrected first, a line before
-    says so, and the command is not `hil export`.
+    """Return the line that names the next command. It is `hil export`, unless the verdict is "no" or asks for something
+    to be corrected first; then it is `hil check` or, for recordings made with other tools, `hil estimate`. A correction
+    is stated on a line of its own before the command.
     """
     first = None if result.verdict is None else result.verdict.first
     if first is not None:

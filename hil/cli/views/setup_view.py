@@ -82,7 +82,7 @@ def _after_scan(servos: Sequence[Found], port: str) -> str:
 
 
 def print_findings(findings: Sequence[Finding], config: Path, *, has_dry_run: bool) -> None:
-    """Print one line per finding, with its fix below it, and whether an experiment can start.
+    """Print one line per finding, with its fix on the line below, and say whether an experiment can start.
 
     has_dry_run: whether the arm is described well enough for `hil dry-run`, which is then the next command.
     """

@@ -217,7 +217,7 @@ def _holm(p: dict[str, float], level: float) -> set[str]:
 
 
 def _scale(before: ArmModel, after: ArmModel, name: str) -> float:
-    """Magnitude to compare a change with: the parameter's own or, for an offset, the joint's Coulomb friction."""
+    """Scale of a change: the magnitude of the parameter or, for an offset, of the joint's Coulomb friction."""
     values = [abs(model.values[name]) for model in (before, after)]
     kind, _, joint = name.rpartition("_")
     if kind == "offset":

@@ -5,7 +5,7 @@ than its standard error and still be obvious. Let d be the difference in the joi
 runs, and S the sum of their covariances in the two runs. Two kinds of test are performed.
 
 one term alone    Did only term i change? The most powerful test is z_i = (S^-1 d)_i / sqrt((S^-1)_ii), and
-                  (S^-1 d)_i / (S^-1)_ii is the change that this implies (generalised least squares).
+                  (S^-1 d)_i / (S^-1)_ii is the estimated change (generalised least squares).
 several at once   Is d more than noise? d' S^-1 d has a chi-square distribution.
 
 Friction itself varies slightly from run to run. The covariance of a single run does not include this, so
@@ -98,7 +98,7 @@ def _of_joint(
 
 
 def _comparable(models: Sequence[ArmModel], name: str) -> bool:
-    """Whether both models have the term, or one has it and the other implies that it is 0."""
+    """Whether both models have the term, or one model has it and the other implies that the term is 0."""
     having = [name in model.values for model in models]
     return all(having) or (any(having) and TERMS[name.rpartition("_")[0]].absent == 0.0 and "velocity" not in name)
 

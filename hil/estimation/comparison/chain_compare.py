@@ -117,7 +117,7 @@ def _methods(config: Config, period: SettledPeriod, judge: Judge) -> Iterator[Pe
 
 
 def _best(fit: Callable[[float], tuple[Array, Array]], judge: Judge, period: SettledPeriod) -> Peer:
-    """The result with the cut-off frequency that reproduces the fitted period best, as for planar arms."""
+    """Return the result for the cut-off frequency that reproduces the fitted period best, as for planar arms."""
     model = judge.model
     found: list[tuple[float, Peer]] = []
     for cutoff in CUTOFFS:
@@ -140,7 +140,7 @@ def _best(fit: Callable[[float], tuple[Array, Array]], judge: Judge, period: Set
 
 
 def _simulated(model: ChainModel, value: Array) -> dict[str, float]:
-    """Parameters of a regression, with the smoothed Coulomb step that it assumes."""
+    """Parameters of a regression, including the width of the smoothed Coulomb step that the regression assumes."""
     named = dict(zip(model.linear_names, value.tolist(), strict=True))
     return named | {f"coulomb_width_{joint + 1}": COULOMB_WIDTH for joint in range(model.joints)}
 

@@ -24,7 +24,7 @@ OFTEN = 0.05
 """Clipping is reported if it affects more than this fraction of the samples with large goals."""
 
 _RECENT = 4
-"""Number of latest goals that a lagging current may still be following."""
+"""Number of most recent goals that a lagging current may still be following."""
 
 _BEYOND, _BEYOND_OFTEN = 0.25, 0.02
 """A current counts as different from the commanded one if it is outside the range spanned by 0 and all recent goals by
@@ -36,7 +36,7 @@ _SIGMAS = 3.0
 """Largest deviation of a reading that is attributed to noise, in standard deviations."""
 
 _QUANTILE, _OF_NORMAL = 0.25, 0.3186
-"""Noise is estimated from this quantile of its magnitude, because goals that are altered now and then must not count as
+"""Noise is estimated from this quantile of its magnitude, because goals that are altered occasionally must not count as
 noise. The second value is the same quantile for the standard normal distribution.
 """
 

@@ -95,7 +95,9 @@ def _jumps(recording: Recording, joint: int) -> list[tuple[float, float]]:
 
 
 def _steps(time: Array, position: Array, uneven: Mask) -> Array:
-    """The step [rad] in the middle of each window of 2 * SIDE samples. uneven: where intervals are unequal."""
+    """The step [rad] in the middle of each window of 2 * SIDE samples. uneven: mask of the windows with unequal
+    intervals.
+    """
     windows = np.lib.stride_tricks.sliding_window_view
     sizes = np.correlate(position, _weights(np.arange(2.0 * SIDE)[None, :])[0], mode="valid")
     places = np.flatnonzero(uneven)
@@ -115,7 +117,7 @@ def _weights(time: Array) -> Array:
 
 
 def _is_step(time: Array, position: Array, noise: float) -> bool:
-    """Whether a step in the middle describes the positions much better than a bad reading or the kink of an impact."""
+    """Whether a step in the middle fits the positions much better than one bad reading or an impact (a kink) does."""
     at = (time - 0.5 * (time[SIDE - 1] + time[SIDE])) / (time[-1] - time[0])
     smooth = [at**order for order in range(ORDER + 1)]
 

@@ -5,12 +5,14 @@ import numpy as np
 from hil.estimator.arrays import Array
 
 STANDS_S = 0.4
-"""Time for which the reading of a sticking joint stays the same [s]: longer than at the reversals of a usual path."""
+"""A joint sticks if its reading stays the same for this time [s], which is longer than at the reversals of a usual
+path.
+"""
 SAME_STEPS = 1.5  # encoder steps within which a reading counts as the same
 
 
 def sticking_joints(position: Array, rate: float, step: Array) -> tuple[int, ...]:
-    """Return the joints, from 0, that stand still for `STANDS_S` during the motion.
+    """Return the joints, numbered from 0, that stand still for `STANDS_S` during the motion.
 
     position: (joints, samples) [rad]; step: encoder steps (joints,) [rad]; rate: sample rate [1/s].
     """

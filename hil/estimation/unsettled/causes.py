@@ -103,7 +103,7 @@ def _clipped(recordings: Sequence[Recording], found: Sequence[Clipped]) -> tuple
 
 
 def _unsigned(recordings: Sequence[Recording], joint: int) -> str:
-    """A sentence if the torque of a joint (from 1) never changes sign; "" otherwise."""
+    """A sentence if the torque of a joint (numbered from 1) never changes sign; "" otherwise."""
     torque = np.concatenate([each.torque[joint - 1] for each in recordings])
     if torque.min() < 0.0 < torque.max():
         return ""
@@ -147,5 +147,5 @@ def _drifting(recordings: Sequence[Recording]) -> tuple[str, ...]:
         f"The delay of the torque drifts from {1e3 * drift.start:+.3g} ms to {1e3 * drift.end:+.3g} ms over the "
         f"recording ({1e6 * drift.relative:+.0f} ppm): with this corrected, "
         f"{unexplained(drift.residual, drift.residual_given)}. Torque and position were timed by different "
-        "clocks: correct the times of one, or log both with the same clock.",
+        "clocks: correct the times of one of them, or log both with the same clock.",
     )

@@ -117,7 +117,7 @@ def estimate_chain_recordings(
 
 
 def _drive(config: RecordingConfig, joints: int) -> Drive:
-    """The configured drive model; by default, for several joints, a common delay and a separate lag for each.
+    """The configured drive model. The default for several joints is a common delay and a separate lag for each joint.
 
     Other tools' recordings may contain both, and a delay does not explain lags that differ between joints.
     """
@@ -146,7 +146,7 @@ def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescripti
 def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior, contradictory: bool) -> RecordedChain:
     """Fit the model to the recordings. contradictory: whether the torques seem to contradict each other.
 
-    If they do, and if they are held between samples, the ratios of the torques are fitted too. If this shows that the
+    If so, and if torques are held between samples, the ratios of the torques are fitted too. If that fit shows that the
     torques agree after all, the model is fitted again without the ratios.
     """
     if contradictory and all(each.between == "held" for each in recordings):
@@ -157,7 +157,7 @@ def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior
 
 
 def _sticking(recordings: Sequence[Recording]) -> tuple[int, ...]:
-    """Return the joints, from 0, that stick in any of the recordings."""
+    """Return the joints, numbered from 0, that stick in any of the recordings."""
     found = set()
     for each in recordings:
         rate = (each.time.size - 1) / (each.time[-1] - each.time[0])
@@ -168,7 +168,7 @@ def _sticking(recordings: Sequence[Recording]) -> tuple[int, ...]:
 def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> Array | None:
     """Return the relative torque error on the last part of each recording, with parameters fitted to the rest.
 
-    None if a part is too short or the arm stands still in it.
+    Returns None if a part is too short or the arm stands still in it.
     """
     try:
         first = [_part(each, 0.0, FITTED_SHARE) for each in recordings]
@@ -302,7 +302,7 @@ def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: b
 
 
 def _foretold_said(error: float, joint: str) -> str:
-    """Describe the prediction of the last part. error: relative to the RMS torque. joint: the worst one."""
+    """Describe how well the last part is predicted. error: relative to the RMS torque. joint: the joint with it."""
     part = f"the torque in the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
     if error > 1.0:
         return (

@@ -28,7 +28,7 @@ SHOWN = 3
 
 @dataclass(frozen=True)
 class _Joint:
-    """One joint of a recording, with the residual of the fit. name: its name in messages."""
+    """One joint of a recording, with the residual of the fit. name: the joint's name in messages."""
 
     name: str
     time: Array

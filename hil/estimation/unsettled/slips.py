@@ -75,7 +75,9 @@ def refuse_slips(
 
 
 def _correction(recordings: Sequence[Recording], signs: Signs, zero: Sequence[float] | None) -> str:
-    """Say how to reverse columns. zero: columns.zero if the user set it; that of a reversed angle must change too."""
+    """Say how to reverse columns. zero: columns.zero if the user set it; its entry for a reversed angle must change
+    too.
+    """
     if zero is None or min(signs.position) > 0:
         return "Correct this in the file."
     moved = turned_zeros(with_signs(recordings, signs))

@@ -1,4 +1,4 @@
-"""Section on how close a spatial arm came to itself and to obstacles, and which of its parts need no margin."""
+"""Section on how close a spatial arm came to itself and to obstacles, and on the parts that need no margin."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -31,8 +31,8 @@ def friction(data: RunData) -> Section | None:
     simulated_dots = _left_to_friction(data.model, period, lines_of(period.predicted), harmonics)
     pictures = [_curve(data, joint, name, measured_dots, simulated_dots) for joint, name in enumerate(data.names)]
     words = (
-        "Dots: commanded torque minus the model's inertia and gravity torque, once for the measured motion and once "
-        "for the model's own. Deriving accelerations from positions alone smooths every reversal, so "
+        "The dots show the commanded torque minus the model's inertia and gravity torque: one set for the measured "
+        "motion, one for the simulated motion. Accelerations derived from positions are smoothed at every reversal, so "
         "near standstill both sets deviate equally from the curve; there, static friction can also take any value that "
         "holds the joint. If the friction model is right, the two sets of dots agree.",
     )
@@ -58,7 +58,7 @@ def _left_to_friction(model: ArmModel, period: PlayedPeriod, lines: Lines, harmo
 def _curve(
     data: RunData, joint: int, name: str, measured: tuple[Array, Array], simulated: tuple[Array, Array]
 ) -> Picture:
-    """Draw one joint's friction. measured, simulated: speeds and friction torques of both motions."""
+    """Draw one joint's friction. measured, simulated: speeds and friction torques of the two motions."""
     fastest = float(np.abs(measured[0][joint]).max())
     # Cubes of an even grid are denser near zero speed, where the curve bends.
     at = fastest * np.linspace(-1, 1, _CURVE) ** 3

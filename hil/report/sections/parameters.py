@@ -77,7 +77,9 @@ def _as_precise(value: float, std: float) -> str:
 
 
 def _decimals(std: float) -> int | None:
-    """Number of decimals that show two digits of the interval's half-width; None if that is too small or unknown."""
+    """Number of decimals that show two digits of the interval's half-width; None if the half-width is too small or
+    unknown.
+    """
     width = TWO_SIDED_95 * std
     if not (width > 0 and math.isfinite(width)):
         return None

@@ -15,9 +15,9 @@ def steps(data: RunData) -> Section | None:
         return None
     outside = [step.name for step in played if not step.within_quantile]
     said = (
-        f"In {listed(outside)}, a peak exceeded the value that the dry run predicted for 99 % of the arms."
+        f"In {listed(outside)}, a peak exceeded the dry run's prediction for 99 of 100 arms."
         if outside
-        else "No peak of a limited quantity exceeded the value that the dry run predicted for 99 % of the arms."
+        else "No peak of a limited quantity exceeded the dry run's prediction for 99 of 100 arms."
     )
     tables = tuple(_table(step, data.config) for step in played)
     return Section("steps", "Predicted and measured peaks", (said,), tables)

@@ -30,7 +30,7 @@ def timing(data: RunData) -> Section:
         ("round trip p50, p99, max", _quantiles(kept.round_trip_us)),
         ("estimation took", f"{kept.estimation_seconds:.2f} s"),
     ]
-    virtual = ("On the fake bus this is virtual time: it describes the simulated wire and adapter, not this machine.",)
+    virtual = ("On the fake bus, times are virtual: they describe the simulated wire and adapter, not this computer.",)
     return Section(
         "timing",
         "Timing",

@@ -111,7 +111,7 @@ def test_a_pair_needs_two_entries() -> None:
         limits: tuple[float, float]
 
     assert from_json(Range, {"limits": [1, 2.5]}) == Range((1.0, 2.5))
-    with pytest.raises(FormError, match="has 3 entries instead of 2 as 'limits'"):
+    with pytest.raises(FormError, match="has 3 entries instead of 2 in 'limits'"):
         from_json(Range, {"limits": [1, 2, 3]})
     assert to_json(Range((1.0, 2.0))) == {"limits": [1.0, 2.0]}
 
