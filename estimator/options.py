@@ -176,7 +176,9 @@ class LikelihoodOptions:
     hopeless_cost: float = 2.0
     """Cost per sample above which a coarse fit is abandoned."""
     refine_ratio: float = 1.01
-    """A candidate with up to this multiple of the best sum of squares may still reach a lower sum when refined."""
+    """A candidate whose sum of squares is at most this multiple of the best one may still reach a lower sum when
+    refined.
+    """
     outlier_threshold: float = 4.0
     """Residual in standard deviations above which a sample is downweighted; rounding alone stays below 1.7."""
     threads: int = 8
@@ -201,8 +203,8 @@ class ShootingOptions:
     start_segments: int = 80
     """Maximum number of segments, evenly distributed, in the fits that only need to come close to a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)
-    """The lower bound on widths is 3e-4 rad/s. At 3e-3 rad/s, friction is smoothed visibly in small motions: Coulomb
-    friction was 1 % too large and viscous friction 1 to 3 % too small, by several standard errors.
+    """The lower bound on widths is 3e-4 rad/s. With 3e-3 rad/s, the smoothing of friction affected small motions:
+    Coulomb friction was 1 % too large and viscous friction 1 to 3 % too small, by several standard errors.
     """
     minimiser: SegmentedMinimiserOptions = SegmentedMinimiserOptions()
     initial_width: float = 0.05
@@ -259,7 +261,7 @@ class SelectionOptions:
     """RMS residual in units of the noise below which a richer model's fit starts at the simpler model's minimum."""
     steady_residual: float = 5.0
     """RMS residual in units of the noise below which changes in friction are searched for; a larger model error may
-    look like one.
+    look like such a change.
     """
     presliding_residual: float = 1.2
     """RMS residual in units of the noise above which a fit with presliding is tried; such fits are slow."""

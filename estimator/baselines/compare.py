@@ -1,4 +1,4 @@
-"""Comparison of other methods, each tuned and timed, on the same settled period.
+"""Comparison of other identification methods, each tuned and timed, on the same settled period.
 
 All methods receive the same positions and commands. The commands are delayed by the value that hil estimated in stage
 1, so that no other method has to estimate the delay. Each method is tuned by trying several settings and keeping those
@@ -55,7 +55,7 @@ def compare_peers(period: SettledPeriod, length: float | None, gravity: float) -
     """Yield the results of IDIM-LS, RLS, EKF, UKF and the linearised method of Zhu et al. on one settled period.
 
     length: length of link 1 [m]; gravity: acceleration of gravity [m/s^2]. The method of Zhu et al. needs both to
-    separate the inertias; if `length` is None, it is skipped on an arm of two joints.
+    separate the inertias; if `length` is None, this method is skipped on an arm of two joints.
     """
     recording = joined(period, 1)
     delay = fit_lines(period).delay

@@ -48,13 +48,14 @@ class InverseDynamics:
     std: Array
     """Standard errors assuming a white residual (parameters,) [SI]."""
     relative_residual: Array
-    """RMS of the torque residual relative to that of the torque (joints,)."""
+    """RMS torque residual of each joint, relative to the RMS of its torque (joints,)."""
 
 
 def uniform(recording: Recording, delay: float = 0.0) -> tuple[Array, Array, float]:
     """Return positions and torques (joints, samples) at equal intervals, and the interval [s].
 
-    Each torque is the mean over the interval centred on its position sample, so that holding the command adds no lag.
+    Each torque is the mean over the interval centred on its position sample, so that the hold of commands between
+    samples adds no lag.
     """
     dt = recording.interval
     count = int((recording.time[-1] - recording.time[0]) / dt)
@@ -79,7 +80,7 @@ def filtered_rows(
 ) -> Rows:
     """Return the rows of the regression; arguments as in `fit_inverse_dynamics`.
 
-    Raises RecordingError if the recording is too short, or its rate is too low, for the filter.
+    Raises RecordingError if the recording is too short for the filter or its sample rate is too low.
     """
     position, torque, dt = uniform(recording, delay)
     trim = int(np.ceil(TRIM / (cutoff * dt)))

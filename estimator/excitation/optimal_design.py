@@ -76,7 +76,7 @@ class DesignProblem:
     def worst(self, wave: Multisine) -> float:
         """Return the largest relative standard error of `names` from a settled period of `wave`.
 
-        It is infinite if the period does not determine all of them.
+        The result is infinite if the period does not determine all of these parameters.
         """
         deviations = self.standard_errors(wave)
         return float((deviations / self.scale()).max())

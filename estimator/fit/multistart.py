@@ -88,8 +88,8 @@ class Search:
         return self._undisguised(refined, replace(minimum, iterations=spent))
 
     def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
-        """Replace Stribeck rises that hardly fall in this motion with Coulomb friction, unless the fit becomes
-        significantly worse.
+        """Replace Stribeck friction that hardly varies with speed in this motion by Coulomb friction, unless the fit
+        becomes significantly worse.
         """
         if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
             return refined, minimum

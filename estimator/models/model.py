@@ -54,7 +54,8 @@ class Model:
             encoder_sin_twice sin 2q + encoder_cos_twice cos 2q.
         lags: adds lag_difference to the lag of the second joint's torque or, without a lag, to its delay.
 
-    Raises ModelError for an unknown name, for torque_scale with one joint, and for arms without one or two joints.
+    Raises ModelError for an unknown name, for torque_scale with one joint, and for arms that do not have one or two
+    joints.
     """
 
     joints: int

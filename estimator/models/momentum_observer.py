@@ -51,7 +51,8 @@ NAMES = (
     *("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
     *("viscous_1", "viscous_2", "coulomb_1", "coulomb_2", "offset_1", "offset_2", "tilt_1", "tilt_2"),
 )
-"""Names of the parameters. The tilts are gravity torques that follow the sines of the angles, due to a tilted base."""
+"""Names of the parameters. The tilts are the gravity torques of a tilted base that vary with the sines of the angles.
+"""
 
 FILTER_S = 0.02
 HOLD_S = 0.05
@@ -156,7 +157,7 @@ class MomentumObserver:
         )  # compiles the loop and initialises the memory
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:
-        """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1.
+        """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1 if there is none.
 
         position: angles [rad]. velocity: velocities [rad/s]. torque: torques commanded since the previous sample [N m].
         seconds: time since the previous sample [s].

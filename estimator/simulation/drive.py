@@ -23,7 +23,7 @@ def motor_torque(
         command_to_sample: time from command k's effect to sample k [s].
         steps: integration steps per sample.
         delay: delay of the torque [s], one value or one per joint.
-        lag: time constant of a subsequent first-order lag [s], likewise.
+        lag: time constant of a subsequent first-order lag [s], one value or one per joint.
     """
     return _torque(command, rate, command_to_sample, steps, delay, lag)[0]
 
