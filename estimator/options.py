@@ -62,7 +62,7 @@ class CoordinateOptions:
     min_initial: float = 1e-3
     """Minimum initial value of a positive parameter, as a fraction of its scale."""
     max_initial_share: float = 0.95
-    """Maximum initial value of a parameter that is a share of two others' geometric mean, as a fraction of its
+    """Maximum initial value of a parameter that is bounded by the geometric mean of two others, as a fraction of this
     bound.
     """
     min_width: float = 1e-3
@@ -78,8 +78,8 @@ class LinearOptions:
     """Options for stage 1, the regression on Fourier coefficients."""
 
     coulomb_width: float = 0.05
-    """Width of the smoothed Coulomb step [rad/s]: roughly the velocity error of a sticking joint that results from
-    omitting Fourier coefficients.
+    """Width of the smoothed Coulomb step [rad/s]: roughly the velocity error that omitting Fourier coefficients causes
+    while a joint sticks.
     """
     max_condition: float = 1e8
 
@@ -132,7 +132,9 @@ class LikelihoodOptions:
     weight.
     """
     least_tempering: float = 1e-4
-    """Minimum relative increase in the sum of squares for which the fit is repeated with the heavier priors."""
+    """Minimum relative increase in the sum of squares for which the fit is repeated with priors that are given more
+    weight.
+    """
 
     initial_widths: tuple[float, ...] = (0.005, 0.05)
     """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried."""
@@ -244,7 +246,7 @@ class SettlingOptions:
 
     max_periods: int = 50
     atol: float = 1e-7
-    """Motion counts as periodic if a period changes the state by no more than this [rad and rad/s]."""
+    """The motion counts as periodic if a period changes the state by no more than this [rad and rad/s]."""
     acceptable: float = 1e-5
     """Change per period that is still accepted after `max_periods` [rad and rad/s]; far below any encoder step."""
 

@@ -29,7 +29,7 @@ WORST_CONDITION = 1e8
 
 @dataclass(frozen=True)
 class Rows:
-    """Filtered regressors and torques, decimated roughly to the rate that their bandwidth requires."""
+    """Filtered regressors and torques, decimated to roughly the rate that their bandwidth requires."""
 
     regressor: Array
     """Regressors (joints, samples, parameters)."""

@@ -129,7 +129,9 @@ def compare(past: Any, j: int, back: int, count: int, floor: float, rounding: fl
 
 
 def keep(past: Any, j: int, mean: float) -> None:
-    """Process the result of joint `j`'s comparisons: a mean residual, or 0 if the earlier model explains it."""
+    """Process the result of joint `j`'s comparisons: a mean residual torque, or 0 if the earlier models explain the
+    torque.
+    """
     head = past[_SLOTS + 1]
     head[_LASTS + j] = head[_LASTS + j] + 1.0 if mean != 0.0 else 0.0
     head[_FOUND + j] = mean if head[_LASTS + j] >= IN_A_ROW else 0.0

@@ -12,12 +12,12 @@ of arms, and are updated with each sample (recursive least squares, that is, a K
 slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as the arm moves.
 
 A joint's residual torque is the part of its torque that the motion does not account for. An alarm is raised if it
-exceeds three thresholds for `HOLD_S` (or for less if it far exceeds them): `TIMES` standard deviations of the
+exceeds three thresholds for `HOLD_S` (or for a shorter time if it far exceeds them): `TIMES` standard deviations of the
 uncertainty due to parameters and noise, the torque that friction can balance while the joint stands still, and a
 fraction of the largest planned torque. The noise is estimated as well, so that effects that the model lacks (Stribeck
 friction, backlash, flexibility) widen the admissible range. A deviation that could lead to an alarm is only included in
 this estimate once it has subsided without causing an alarm. Otherwise, if something held a joint for a long time, the
-range would widen until nothing exceeded it. A lower noise is assumed while a joint stands still, since most noise
+range would widen until nothing exceeded it. A lower noise level is assumed while a joint stands still, since most noise
 arises only in motion.
 
 Once a joint's angle has stayed within its gear's play for `_STAYS_S`, the reported velocity does not show in which

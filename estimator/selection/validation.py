@@ -72,7 +72,7 @@ class Validation:
 
 
 def validate(period: SettledPeriod, estimate: Estimate, gravity: bool = True) -> Validation:
-    """Check `estimate` against the period to which it was fitted. gravity: whether it acts in the arm's plane."""
+    """Check `estimate` against the period to which it was fitted. gravity: whether gravity acts in the arm's plane."""
     residual = np.nan_to_num(estimate.residual)
     lags = min(LAGS, period.samples // 4)
     band = 1.96 / np.sqrt(period.samples)

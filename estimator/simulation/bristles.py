@@ -42,7 +42,8 @@ def has_bristles(physics: Physics) -> bool:
 def first_bend(physics: Physics, velocity: Array) -> Array:
     """Return the bristles' torque (joints,) [N m] at the start of a simulation, as in steady sliding.
 
-    `velocity` (joints,) [rad/s]. For a joint that hardly moves, the deflection is unknown and assumed to be small.
+    velocity: initial velocities (joints,) [rad/s]. The deflection of a joint that hardly moves is unknown and is
+    assumed to be small.
     """
     joints = velocity.size
     p = physics.vector

@@ -108,8 +108,8 @@ class Simulation:
     def go_on(self, run_: ChainRun, piece: slice) -> tuple[Array | None, Array]:
         """Simulate the next `piece` of the samples.
 
-        Returns the angles (samples, joints) [rad], None if the motion diverges, and their derivatives with respect to
-        `names` and the initial state (samples, joints, names and initial state).
+        Returns the angles (samples, joints) [rad], or None instead if the motion diverges, and their derivatives with
+        respect to `names` and the initial state (samples, joints, names and initial state).
         """
         torque, measured = run_.torque[piece], run_.measured[piece]
         position = np.empty(measured.shape)
