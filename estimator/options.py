@@ -200,7 +200,7 @@ class ShootingOptions:
     """Longest integration step of the last fit [s]."""
     coarse_step: float = 2.6e-3
     """Longest integration step of the earlier fits [s]. They run three times as fast as with `max_step`; their errors
-    are hundredths of a standard error.
+    amount to hundredths of a standard error.
     """
     start_segments: int = 80
     """Maximum number of segments, evenly distributed, in the fits that only need to come close to a minimum."""

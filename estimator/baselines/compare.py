@@ -1,7 +1,7 @@
 """Comparison of other identification methods, each tuned and timed, on the same settled period.
 
-All methods receive the same positions and commands. The commands are delayed by the value that hil estimated in stage
-1, so that no other method has to estimate the delay. Each method is tuned by trying several settings and keeping those
+All methods receive the same positions and commands. The commands are delayed by the time that hil estimated in stage 1,
+so that no other method has to estimate the delay. Each method is tuned by trying several settings and keeping those
 whose simulation is closest to the recording; only the run time with these settings is reported.
 """
 
@@ -114,7 +114,7 @@ def _best(
         peer = Peer(name, parameters, std, seconds, words.format(*setting), len(settings))
         found.append((_misfit(recording, parameters), peer))
     if not found:
-        raise EstimationError(f"{name} failed with all {len(settings)} of its settings")
+        raise EstimationError(f"{name} failed with each of its {len(settings)} settings")
     return min(found, key=lambda pair: pair[0])[1]
 
 

@@ -1,7 +1,7 @@
 """Filtered inverse-dynamics least squares (IDIM-LS), the standard method of the field; used for initial guesses and for
 comparison.
 
-Position is low-pass filtered forwards and backwards and differentiated by central differences, and the regressor is
+The position is low-pass filtered forwards and backwards and differentiated by central differences, and the regressor is
 evaluated. Regressor and torque are filtered identically and decimated, and one weighted linear least-squares problem is
 solved: Gautier and Poignet, "Extended Kalman filtering and weighted least squares dynamic identification of robot",
 Control Engineering Practice 9 (2001) 1361; Swevers, Verdonck, De Schutter, "Dynamic model identification for industrial
@@ -54,8 +54,8 @@ class InverseDynamics:
 def uniform(recording: Recording, delay: float = 0.0) -> tuple[Array, Array, float]:
     """Return positions and torques (joints, samples) at equal intervals, and the interval [s].
 
-    Each torque is the mean over the interval centred on its position sample, so that the hold of commands between
-    samples adds no lag.
+    Each torque is the mean over the interval centred on its position sample, so that holding commands between samples
+    adds no lag.
     """
     dt = recording.interval
     count = int((recording.time[-1] - recording.time[0]) / dt)

@@ -57,7 +57,7 @@ class ChainCalibration:
     estimate: ChainEstimate
     """The fit, whose values are in units of the first joint's assumed torque constant."""
     value: Array
-    """Parameters `ChainModel.linear_names` of the arm without the mass, scaled to the identified torque constants [SI].
+    """Values of `ChainModel.linear_names` for the arm without the mass, scaled to the identified torque constants [SI].
     """
     std: Array
     residual_steps: Array

@@ -1,5 +1,5 @@
-"""Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, a wrong time
-scale.
+"""Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, and a wrong
+time scale.
 
 As for planar arms (`hil.estimator.baselines.signs`), the torque residual of filtered inverse dynamics with a column
 changed is compared with the residual for the columns as given. Changing the signs and scale factors of torques only
@@ -79,7 +79,7 @@ class Swapped:
 
 @dataclass(frozen=True)
 class Late:
-    """Torque that was logged `seconds` after it acted; negative if before. residuals: those of the joint's torque."""
+    """Torque that was logged `seconds` after it acted (before, if negative). residuals: those of the joint's torque."""
 
     residuals: tuple[float, float]
     joint: int | None

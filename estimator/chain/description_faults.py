@@ -131,8 +131,8 @@ def _smoothed(series: Array, follows: float) -> Array:
 
 
 def better_descriptions(chain: Chain, known: Known, motion: Motion, rest: Array) -> tuple[Change, ...]:
-    """Return the changes that explain the motion much better than the description as given, the best first; () if there
-    is none, or if too many are equally good.
+    """Return the changes that explain the motion much better than the description as given, the best first. The result
+    is empty if there are no such changes, or if too many are equally good.
 
     rest: angles in the rest pose (joints,) [rad].
     """
@@ -192,8 +192,8 @@ def _changed(chain: Chain, change: Change) -> Chain:
 
 
 def _misfit(arm: tuple[BaseParameters, Array, Array], motion: Motion) -> float:
-    """Sum of the squared torque residuals and of the parameters' squared distance from their prior, both in units of
-    standard deviations, for the parameters that minimise it.
+    """Minimum, over the parameters, of the squared torque residuals plus the parameters' squared distance from their
+    prior, both in units of standard deviations.
     """
     base, mean, covariance = arm
     n, samples = motion.position.shape

@@ -63,7 +63,7 @@ def settling_difference(former: Array, latest: Array) -> float:
 class Decay:
     """A change from period to period that decreases by about the same factor each time.
 
-    ratio: that factor. further: number of further periods until the change is within tolerance.
+    ratio: factor between successive changes. further: number of further periods until the change is within tolerance.
     """
 
     ratio: float

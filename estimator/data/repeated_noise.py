@@ -180,7 +180,7 @@ def _not_drifted(difference: Array, differs: Array) -> Array:
 
 
 def _repeating(differs: float, kept: Array) -> float:
-    """Return the repeating power of the rounding error [steps^2].
+    """Return the power of the repeating part of the rounding error [steps^2].
 
     differs: half the mean square of the difference [steps^2]. kept: fraction of each order that drift leaves (orders,).
     """

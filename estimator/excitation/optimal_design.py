@@ -97,8 +97,8 @@ class DesignProblem:
         return deviations
 
     def scale(self) -> Array:
-        """Return the divisor of each standard error: the parameter or, for an offset, the joint's Coulomb friction
-        [SI].
+        """Return the values by which standard errors are divided: the parameters or, for offsets, the joints' Coulomb
+        friction [SI].
         """
         known = dict(zip(CONSTANTS, self.physics.vector.tolist(), strict=True))
         against = [name.replace("offset", "coulomb") if name.startswith("offset") else name for name in self.names]

@@ -58,7 +58,7 @@ class Search:
     """The objective with coarse integration steps."""
     options: LikelihoodOptions
     coarse: bool
-    """Whether to end fits before full convergence if the residual is well above the noise; this suffices to compare
+    """Whether to end fits before full convergence if the residual is well above the noise; such fits suffice to compare
     models.
     """
 

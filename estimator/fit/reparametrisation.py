@@ -165,7 +165,7 @@ class Coordinates:
 
     @cached_property
     def _shares(self) -> list[tuple[int, int, int]]:
-        """Index triples: a parameter, and the two others whose geometric mean bounds it."""
+        """Index triples: a parameter, then the two parameters whose geometric mean bounds it."""
         shares = []
         for share, name in enumerate(self.names):
             bounds, joint = term_of(name).share_of, joint_of(name)

@@ -88,7 +88,8 @@ def fit_runs(
         periods: settled periods of one arm.
         model: the model to fit.
         linear: stage 1's estimate for the same periods.
-        coarse: whether to end the fit early if the residual is well above the noise; this suffices to compare models.
+        coarse: whether to end the fit early if the residual is well above the noise; such a fit suffices to compare
+            models.
         starts: additional initial guesses, parameters by name [SI], tried before all others.
         near: point known to be close to a minimum, used as the only initial guess.
         options: tolerances and limits.

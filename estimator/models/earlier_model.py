@@ -80,7 +80,7 @@ def describe(past: Any, j: int, count: int, noise: float, friction: float) -> No
 
 
 def store(past: Any, theta: Any, covariance: Any) -> None:
-    """Store the current moment with the parameters `theta` and their `covariance`."""
+    """Store the current moment (the sums so far) with the parameters `theta` and their `covariance`."""
     count, head = theta.size, past[_SLOTS + 1]
     row = past[int(head[_NEXT])]
     at = 1 + 2 * (_ROW + count) + 4

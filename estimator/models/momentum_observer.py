@@ -407,8 +407,8 @@ def _look_back(
     rounding: float,
     dt: float,
 ) -> float:
-    """Process joint j's sample; return its mean residual torque if the earlier model has failed to explain it for long
-    enough, otherwise 0.
+    """Process joint j's sample; return its mean residual torque if the earlier model has failed to explain the torque
+    for long enough, otherwise 0.
 
     stands: filtered indicator of standstill. friction: static friction [N m]. rounding: variance of the residual.
     """

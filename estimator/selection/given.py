@@ -32,7 +32,7 @@ def fit_given(
     """Return the best fit of `model` to `period`.
 
     starts: additional initial guesses as in `hil.estimator.identify.identify`.
-    Raises the errors of `identify`.
+    Raises the same errors as `identify`.
     """
     waves = [wave for wave in WAVES if wave in model.options]
     try:

@@ -76,7 +76,7 @@ def choose_by_shooting(
     torque_scale: bool = False,
     options: SelectionOptions = DEFAULTS,
 ) -> SegmentChoice:
-    """Fit friction with the terms that the recordings support.
+    """Fit a friction model with the terms that the recordings support.
 
     Arguments as for `estimate_by_shooting`. torque_scale: whether to fit the ratio of the torque constants even if the
     recordings do not support it.

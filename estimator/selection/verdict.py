@@ -110,7 +110,7 @@ class Evidence:
     cause: str = ""
     """A likely cause of any residual, known from how the motion was driven, as a sentence."""
     ended_early: bool = False
-    """Whether the held-out motion is missing because the recording ends before it settles."""
+    """Whether the held-out motion is missing because the recording ends before that motion settles."""
 
 
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:

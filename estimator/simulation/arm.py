@@ -176,7 +176,7 @@ def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: f
 
 
 def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float, pieces: Any, left: int) -> int:
-    """Return how many of the `left` substeps of length `piece` [s] may be taken at once.
+    """Return how many of the `left` remaining substeps of length `piece` [s] may be taken at once.
 
     v1, v2: velocities [rad/s]. a1, a2: last accelerations [rad/s^2]. pieces: number of substeps in a step while each
     joint is near standstill (joints,); a substep is a step divided by the larger of them.

@@ -114,7 +114,7 @@ def _average_loop(
 
 
 def _follow(command: Any, j: int, rate: float, lag: float, lagging: Any) -> None:
-    """Compute joint j's periodic lagging torque at each command, and its derivative with respect to lag.
+    """Compute joint j's lagging torque, which is periodic, at each command, and its derivative with respect to lag.
 
     The result is written to `lagging` (2, samples). The torque obeys y[k + 1] = a y[k] + (1 - a) u[k]; the steady state
     follows from the value after one period that starts at zero.

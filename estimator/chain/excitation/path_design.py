@@ -1,8 +1,8 @@
 """Paths whose amplitudes, phases and centre make the least certain base parameter as certain as possible.
 
-The search is an evolution strategy (a mean that moves towards the better half of random variations, N. Hansen and A.
-Ostermeier, Evolutionary Computation 9 (2001) 159, with a single step size) over the coefficients of the finite Fourier
-series of `hil.estimator.chain.excitation.fourier_path`. Every variation is scaled to the limits of position and speed
+The search varies the coefficients of the finite Fourier series of `hil.estimator.chain.excitation.fourier_path`. It is
+an evolution strategy with a single step size, whose mean moves towards the best of many random variations (N. Hansen
+and A. Ostermeier, Evolutionary Computation 9 (2001) 159). Every variation is scaled to the limits of position and speed
 and then shrunk until `allowed` accepts it.
 
 Friction, too, is treated as unknown. If it were known, slow, creeping motion would seem to identify a light joint,

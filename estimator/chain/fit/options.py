@@ -25,7 +25,7 @@ class ChainOptions:
     fine_step: float = 1.3e-3
     """Integration step of the last iterations [s]."""
     finer: int = 16
-    """Number of smaller steps into which a step near standstill is divided, since friction changes fast there."""
+    """Number of smaller steps into which a step near standstill is divided, since friction changes rapidly there."""
     finest: int = 64
     """Number of smaller steps into which a step near standstill is divided in the last iterations."""
     widths_per_substep: float = CoordinateOptions.widths_per_substep

@@ -120,8 +120,8 @@ def complete(lost: Losses, derivative: Array) -> None:
 
 
 def _generating(joints: int, parameters: Mapping[str, float]) -> list[tuple[int, float, float, float]]:
-    """Return each voltage-driven joint, the fraction of its viscous friction due to back-EMF, that friction, and the
-    joint's delay.
+    """For each voltage-driven joint, return its index, the fraction of its viscous friction that is due to back-EMF,
+    its viscous friction, and its delay.
     """
     late = lags_of(parameters, joints) + max(parameters.get("delay", 0.0), 0.0)
     return [

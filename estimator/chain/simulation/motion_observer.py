@@ -60,7 +60,7 @@ class ChainObserver:
     covariance: covariance of `mean`.
     largest: largest planned torque of each joint (joints,) [N m].
     interval: sampling interval [s].
-    frictions: `largest` is raised to at least this multiple of the dry friction of each joint for which that is known.
+    frictions: `largest` is raised to at least this multiple of the dry friction, as far as that friction is known.
 
     Raises ValueError for arrays of other shapes.
     """

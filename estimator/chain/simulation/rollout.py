@@ -172,7 +172,7 @@ def weights(arms: ChainArms, pose: Array) -> Array:
 
 
 def mass_matrices(chain: Chain, link: Array, armature: Array, poses: Array) -> Array:
-    """Mass matrices of one arm in `poses` (poses, joints), (poses, joints, joints) [kg m^2].
+    """Return the mass matrices (poses, joints, joints) [kg m^2] of one arm in `poses` (poses, joints).
 
     link: inertial parameters (joints, 10). armature: (joints,).
     """

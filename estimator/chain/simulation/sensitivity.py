@@ -14,7 +14,7 @@ from hil.estimator.chain.model.tilt import TILT, tilt_slopes, tilted
 from hil.estimator.chain.simulation.stepping import JOINT_TERMS, run
 
 ABSENT = {"coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}
-"""Values that disable terms absent from the model; terms not listed here are disabled by 0."""
+"""Values that disable terms absent from the model; terms not listed here are disabled by the value 0."""
 AT_ONCE = 8
 LINE = 8  # numbers in a cache line
 
