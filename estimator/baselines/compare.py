@@ -36,7 +36,7 @@ Setting = tuple[float, float]
 
 @dataclass(frozen=True)
 class Peer:
-    """Result of one of the other methods."""
+    """Result of another identification method."""
 
     name: str
     parameters: dict[str, float]

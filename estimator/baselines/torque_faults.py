@@ -99,7 +99,8 @@ class Uneven:
     """Two joints whose motions are explained best by different delays of their torques.
 
     late, early: the joints (from 1) with the longest and the shortest delay. by: difference between these delays [s].
-    residual, residual_given: relative RMS of one joint's torque residual, with its own delay and with the other's.
+    residual, residual_given: relative RMS of one joint's torque residual, with its own best delay and with that of the
+    other joint.
     """
 
     late: int

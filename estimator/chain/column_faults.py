@@ -99,7 +99,7 @@ class _Solved:
         return float(self.relative.max())
 
     def distance(self, prior: Prior) -> float:
-        """Squared distance between the base parameters and the description's, in units of the prior's standard
+        """Squared distance between the base parameters and those of the description, in units of the prior's standard
         deviations.
         """
         return float(np.sum(np.square((self.value[: prior.value.size] - prior.value) / prior.std)))

@@ -230,7 +230,7 @@ class Search:
     def _at_once(self, fits: Sequence[Callable[[], Minimum]]) -> list[Minimum]:
         """Run independent fits in threads; compiled code releases the GIL.
 
-        Fits that do not converge are ignored if any other does; otherwise, ConvergenceError is raised.
+        Fits that do not converge are ignored if at least one fit converges; otherwise, ConvergenceError is raised.
         """
         found: list[Minimum] = []
         lost = ConvergenceError("no fit was started")

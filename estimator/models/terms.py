@@ -290,7 +290,7 @@ _DECLARED = (
     Term(
         "lag_difference",
         "s",
-        "additional lag of the joint's torque relative to joint 1's; without lag, additional delay",
+        "additional lag of the joint's torque relative to joint 1's; without a lag, additional delay",
         part="lags",
         first_joint=2,
         range="any",

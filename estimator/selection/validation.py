@@ -49,7 +49,7 @@ class Validation:
     Lags of 1 to LAGS samples are used.
     """
     free_run: Array | None
-    """RMS error of simulating the fitted period from rest, relative to the motion's RMS (joints,).
+    """RMS error of a simulation of the fitted period from rest, relative to the motion's RMS (joints,).
 
     None if the simulation does not settle.
     """

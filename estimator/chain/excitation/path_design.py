@@ -202,7 +202,9 @@ class PathDesigner:
         return float((1.0 - _MEAN_SHARE) * errors.max() + _MEAN_SHARE * errors.mean())
 
     def _errors(self, path: Path, every: int) -> Array:
-        """Return the base parameters' standard errors from one period, relative to the prior's (base parameters,)."""
+        """Return the base parameters' standard errors after one period, relative to those of the prior (base
+        parameters,).
+        """
         some = slice(0, None, every)
         Y = self._base.regressor(path.position[:, some], path.velocity[:, some], path.acceleration[:, some])
         level = np.sqrt(np.mean((Y @ self._prior.value) ** 2, axis=1) + self._friction**2) + 1e-6

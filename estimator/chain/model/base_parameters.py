@@ -43,7 +43,8 @@ NOTHING = 1e-9
 class BaseParameters:
     """The base parameters of a chain.
 
-    Each is a combination of parameters, named after the one to which it reduces if the others are zero.
+    Each base parameter is a combination of parameters, and is named after the parameter that remains if all others are
+    zero.
     """
 
     chain: Chain

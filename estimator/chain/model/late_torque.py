@@ -2,8 +2,8 @@
 
 The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
 product of back-EMF and lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due
-to back-EMF. The lag of a winding cancels at most half of a joint's inertia, namely when the poles of the equivalent
-motor coincide. Far from a fit's minimum, the computed loss may be greater; it is then limited to that half.
+to back-EMF. The lag of a winding cancels at most half of a joint's inertia; it cancels half if the poles of the
+equivalent motor coincide. Far from a fit's minimum, the computed loss may be greater; it is then limited to that half.
 """
 
 from collections.abc import Mapping, Sequence
