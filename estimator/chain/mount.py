@@ -51,7 +51,7 @@ class Opposed:
 
 @dataclass(frozen=True)
 class _Agreement:
-    """How well one direction of gravity agrees with the recording and the description.
+    """How one direction of gravity suits the recording and the description.
 
     residual: mean logarithm of the joints' relative torque residuals. distance: sum of squared deviations of the base
     parameters from the description, in units of its uncertainty.
