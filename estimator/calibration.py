@@ -44,7 +44,7 @@ class KnownMass:
     mass: float
     """Mass [kg]."""
     distance: float
-    """Distance of its centre of mass from the last joint [m]."""
+    """Distance from the last joint to the mass's centre of mass [m]."""
     inertia: float = 0.0
     """Inertia about its own centre of mass [kg m^2]."""
     length: float = 0.0

@@ -18,7 +18,7 @@ PACKAGE = __name__.split(".", maxsplit=1)[0]
 def compiled(function: Callable[..., Any], **options: Any) -> Any:
     """Compile `function` to run without the GIL, and cache the result on disk until its code or constants change."""
     dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
-    # These attributes of numba are not public. Without this, the cache would only check the date of one file, as
+    # These attributes of numba are not public. Without a stamp, the cache would only check the date of one file, as
     # numba's own cache does.
     on_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if on_file is not None:
@@ -33,15 +33,16 @@ def inner(function: Any, **options: Any) -> Any:
 
 
 def embedded(function: Any, **options: Any) -> Any:
-    """Compile as `inner` does, but without the wrapper for Python, which takes an eighth of the compilation time.
+    """Compile as `inner` does, but without the wrapper for calls from Python; this saves an eighth of the compilation
+    time.
 
-    Only compiled code may call it: a call from Python ends the process.
+    Only compiled code may call the result: a call from Python crashes the process.
     """
     return inner(function, no_cpython_wrapper=True, **options)
 
 
 def only_version(dispatcher: Any) -> Any:
-    """Return the machine code of a compiled function that has been called with arguments of one set of types.
+    """Return the machine code of a compiled function that has always been called with the same argument types.
 
     Calling it skips the lookup of the argument types, which takes 0.1 us per array. Use it only where these types never
     change. Without a compiler (NUMBA_DISABLE_JIT) or with several versions, the function is returned unchanged.
@@ -86,7 +87,7 @@ def _options(function: Any) -> str:
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:
-    """Yield the code object and those of the functions and comprehensions in it."""
+    """Yield a code object, then the code objects of all functions and comprehensions in it."""
     yield code
     for value in code.co_consts:
         if isinstance(value, CodeType):
@@ -96,7 +97,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 def _used(function: FunctionType) -> Iterator[tuple[str, Any]]:
     """Yield the names and values of the package's globals and module attributes that the function may use.
 
-    Libraries are left out: numba's cache depends on numba's version, and numba implements numpy's functions itself.
+    Libraries are left out, since numba implements numpy's functions itself, and its cache depends on its own version.
     """
     names = sorted({name for code in _codes(function.__code__) for name in code.co_names})
     for name in names:

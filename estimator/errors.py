@@ -42,7 +42,7 @@ class UnidentifiableError(EstimationError):
 
 
 class ConvergenceError(EstimationError):
-    """No minimum of the likelihood was found: the model or the initial guess is too far from the data."""
+    """The fit found no minimum: the model or the initial guess is too far from the data."""
 
 
 class PeriodicityError(EstimationError):

@@ -68,7 +68,8 @@ def identify(
     Args:
         periods: one settled period, or several of the same arm, which are fitted together.
         model: the model to fit.
-        coarse: whether to end the fit early if the residual is well above the noise; this suffices to compare models.
+        coarse: whether to end the fit early if the residual is well above the noise; such a fit suffices to compare
+            models.
         starts: additional initial guesses, parameters by name [SI], such as those from another experiment or similar
             arms.
         near: point known to be close to a minimum, used as the only initial guess; this is much faster.

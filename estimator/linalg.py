@@ -31,14 +31,14 @@ __all__ = [
 ]
 
 NOT_FINITE = re.compile(r"not finite|infs or NaNs")
-"""Text of scipy's ValueErrors about values that are not finite; other ValueErrors are the caller's fault."""
+"""Text in scipy's ValueErrors about non-finite values; any other ValueError is due to a wrong call."""
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
 def _guarded(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Wrap `function` so that errors due to the data, not to a wrong call, become ConvergenceErrors."""
+    """Wrap `function` so that errors caused by the data rather than by a wrong call become ConvergenceErrors."""
 
     @wraps(function)
     def guarded(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

@@ -62,7 +62,7 @@ class CoordinateOptions:
     min_initial: float = 1e-3
     """Minimum initial value of a positive parameter, as a fraction of its scale."""
     max_initial_share: float = 0.95
-    """Maximum initial value of a parameter that is a share of two others' geometric mean, as a fraction of its
+    """Maximum initial value of a parameter that is bounded by the geometric mean of two others, as a fraction of this
     bound.
     """
     min_width: float = 1e-3
@@ -78,8 +78,8 @@ class LinearOptions:
     """Options for stage 1, the regression on Fourier coefficients."""
 
     coulomb_width: float = 0.05
-    """Width of the smoothed Coulomb step [rad/s]: roughly the velocity error of a sticking joint that results from
-    omitting Fourier coefficients.
+    """Width of the smoothed Coulomb step [rad/s]: roughly the velocity error that omitting Fourier coefficients causes
+    while a joint sticks.
     """
     max_condition: float = 1e8
 
@@ -132,7 +132,9 @@ class LikelihoodOptions:
     weight.
     """
     least_tempering: float = 1e-4
-    """Minimum relative increase in the sum of squares for which the fit is repeated with the heavier priors."""
+    """Minimum relative increase in the sum of squares for which the fit is repeated with priors that are given more
+    weight.
+    """
 
     initial_widths: tuple[float, ...] = (0.005, 0.05)
     """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried."""
@@ -176,7 +178,9 @@ class LikelihoodOptions:
     hopeless_cost: float = 2.0
     """Cost per sample above which a coarse fit is abandoned."""
     refine_ratio: float = 1.01
-    """A candidate with up to this multiple of the best sum of squares may still reach a lower sum when refined."""
+    """A candidate whose sum of squares is at most this multiple of the best one may still reach a lower sum when
+    refined.
+    """
     outlier_threshold: float = 4.0
     """Residual in standard deviations above which a sample is downweighted; rounding alone stays below 1.7."""
     threads: int = 8
@@ -196,13 +200,13 @@ class ShootingOptions:
     """Longest integration step of the last fit [s]."""
     coarse_step: float = 2.6e-3
     """Longest integration step of the earlier fits [s]. They run three times as fast as with `max_step`; their errors
-    are hundredths of a standard error.
+    amount to hundredths of a standard error.
     """
     start_segments: int = 80
     """Maximum number of segments, evenly distributed, in the fits that only need to come close to a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)
-    """The lower bound on widths is 3e-4 rad/s. At 3e-3 rad/s, friction is smoothed visibly in small motions: Coulomb
-    friction was 1 % too large and viscous friction 1 to 3 % too small, by several standard errors.
+    """The lower bound on widths is 3e-4 rad/s. With 3e-3 rad/s, the smoothing of friction affected small motions:
+    Coulomb friction was 1 % too large and viscous friction 1 to 3 % too small, by several standard errors.
     """
     minimiser: SegmentedMinimiserOptions = SegmentedMinimiserOptions()
     initial_width: float = 0.05
@@ -242,7 +246,7 @@ class SettlingOptions:
 
     max_periods: int = 50
     atol: float = 1e-7
-    """Motion counts as periodic if a period changes the state by no more than this [rad and rad/s]."""
+    """The motion counts as periodic if a period changes the state by no more than this [rad and rad/s]."""
     acceptable: float = 1e-5
     """Change per period that is still accepted after `max_periods` [rad and rad/s]; far below any encoder step."""
 
@@ -259,7 +263,7 @@ class SelectionOptions:
     """RMS residual in units of the noise below which a richer model's fit starts at the simpler model's minimum."""
     steady_residual: float = 5.0
     """RMS residual in units of the noise below which changes in friction are searched for; a larger model error may
-    look like one.
+    look like such a change.
     """
     presliding_residual: float = 1.2
     """RMS residual in units of the noise above which a fit with presliding is tried; such fits are slow."""

@@ -1,7 +1,7 @@
-"""Comparison of other methods, each tuned and timed, on the same settled period.
+"""Comparison of other identification methods, each tuned and timed, on the same settled period.
 
-All methods receive the same positions and commands. The commands are delayed by the value that hil estimated in stage
-1, so that no other method has to estimate the delay. Each method is tuned by trying several settings and keeping those
+All methods receive the same positions and commands. The commands are delayed by the time that hil estimated in stage 1,
+so that no other method has to estimate the delay. Each method is tuned by trying several settings and keeping those
 whose simulation is closest to the recording; only the run time with these settings is reported.
 """
 
@@ -36,7 +36,7 @@ Setting = tuple[float, float]
 
 @dataclass(frozen=True)
 class Peer:
-    """Result of one of the other methods."""
+    """Result of another identification method."""
 
     name: str
     parameters: dict[str, float]
@@ -55,7 +55,7 @@ def compare_peers(period: SettledPeriod, length: float | None, gravity: float) -
     """Yield the results of IDIM-LS, RLS, EKF, UKF and the linearised method of Zhu et al. on one settled period.
 
     length: length of link 1 [m]; gravity: acceleration of gravity [m/s^2]. The method of Zhu et al. needs both to
-    separate the inertias; if `length` is None, it is skipped on an arm of two joints.
+    separate the inertias; if `length` is None, this method is skipped on an arm of two joints.
     """
     recording = joined(period, 1)
     delay = fit_lines(period).delay
@@ -114,7 +114,7 @@ def _best(
         peer = Peer(name, parameters, std, seconds, words.format(*setting), len(settings))
         found.append((_misfit(recording, parameters), peer))
     if not found:
-        raise EstimationError(f"{name} failed with all {len(settings)} of its settings")
+        raise EstimationError(f"{name} failed with each of its {len(settings)} settings")
     return min(found, key=lambda pair: pair[0])[1]
 
 

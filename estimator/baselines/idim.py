@@ -1,7 +1,7 @@
 """Filtered inverse-dynamics least squares (IDIM-LS), the standard method of the field; used for initial guesses and for
 comparison.
 
-Position is low-pass filtered forwards and backwards and differentiated by central differences, and the regressor is
+The position is low-pass filtered forwards and backwards and differentiated by central differences, and the regressor is
 evaluated. Regressor and torque are filtered identically and decimated, and one weighted linear least-squares problem is
 solved: Gautier and Poignet, "Extended Kalman filtering and weighted least squares dynamic identification of robot",
 Control Engineering Practice 9 (2001) 1361; Swevers, Verdonck, De Schutter, "Dynamic model identification for industrial
@@ -29,7 +29,7 @@ WORST_CONDITION = 1e8
 
 @dataclass(frozen=True)
 class Rows:
-    """Filtered regressors and torques, decimated roughly to the rate that their bandwidth requires."""
+    """Filtered regressors and torques, decimated to roughly the rate that their bandwidth requires."""
 
     regressor: Array
     """Regressors (joints, samples, parameters)."""
@@ -48,13 +48,14 @@ class InverseDynamics:
     std: Array
     """Standard errors assuming a white residual (parameters,) [SI]."""
     relative_residual: Array
-    """RMS of the torque residual relative to that of the torque (joints,)."""
+    """RMS torque residual of each joint, relative to the RMS of its torque (joints,)."""
 
 
 def uniform(recording: Recording, delay: float = 0.0) -> tuple[Array, Array, float]:
     """Return positions and torques (joints, samples) at equal intervals, and the interval [s].
 
-    Each torque is the mean over the interval centred on its position sample, so that holding the command adds no lag.
+    Each torque is the mean over the interval centred on its position sample, so that holding commands between samples
+    adds no lag.
     """
     dt = recording.interval
     count = int((recording.time[-1] - recording.time[0]) / dt)
@@ -79,7 +80,7 @@ def filtered_rows(
 ) -> Rows:
     """Return the rows of the regression; arguments as in `fit_inverse_dynamics`.
 
-    Raises RecordingError if the recording is too short, or its rate is too low, for the filter.
+    Raises RecordingError if the recording is too short for the filter or its sample rate is too low.
     """
     position, torque, dt = uniform(recording, delay)
     trim = int(np.ceil(TRIM / (cutoff * dt)))

@@ -93,7 +93,7 @@ def fit_by_kalman(
 
 
 def _scales(names: tuple[str, ...], start: Array) -> Array:
-    """Return the scale of each parameter, which is the largest magnitude among parameters of its kind."""
+    """Return the scale of each parameter: the largest magnitude among the parameters of its kind."""
     groups = dict.fromkeys(("coupling", "armature"), "inertia") | dict.fromkeys(TORQUES, "torque")
     kinds = [groups.get(name.split("_")[0], name.split("_")[0]) for name in names]
     largest = {kind: max(abs(v) for v, k in zip(start, kinds, strict=True) if k == kind) for kind in kinds}
@@ -103,7 +103,7 @@ def _scales(names: tuple[str, ...], start: Array) -> Array:
 def _accelerations(p: Any, width: float, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> Any:
     """Return the accelerations for the twelve constants `p`.
 
-    A lower bound on the determinant keeps them finite if a filter's parameters leave the physical range.
+    A lower bound on the determinant keeps the accelerations finite if a filter's parameters leave the physical range.
     """
     across = p[1] * np.cos(q2)
     turning = p[1] * np.sin(q2)
@@ -154,7 +154,7 @@ def _constants(x: Any, scale: Any, slots: Any, fixed: Any, joints: int, p: Any) 
 
 
 def _correct(x: Any, P: Any, R: Any, measured: Any) -> None:
-    """Update `x` and `P` with a position sample, joint by joint, as the measurement errors are independent."""
+    """Update `x` and `P` with a position sample, one joint at a time, since their errors are independent."""
     n = x.size
     for j in range(measured.size):
         s = P[j, j] + R[j]

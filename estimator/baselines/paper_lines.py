@@ -31,9 +31,9 @@ class LinearisedEstimate:
 def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) -> LinearisedEstimate:
     """Fit the linear response about the hanging pose to the Fourier coefficients of a period by least squares.
 
-    length: length of link 1 [m]. The linear response of two joints determines three combinations of the four inertias;
-    coupling = length gravity_2 / gravity is the fourth equation. Raises ModelError if the gravity term or the length is
-    missing.
+    length: length of link 1 [m]. The linear response of two joints determines only three combinations of the four
+    inertias; the fourth equation is coupling = length gravity_2 / gravity. Raises ModelError if the gravity term or the
+    length is missing.
     """
     if gravity <= 0.0:
         raise ModelError("the method of Zhu et al. linearises about the hanging pose, which requires gravity")

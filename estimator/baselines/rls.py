@@ -1,8 +1,8 @@
 """Recursive least squares on causally filtered signals, the on-line baseline.
 
 Position passes through a causal low-pass filter and is differenced; the regressor is evaluated and filtered again. The
-torque passes through the same filter twice, so that both have the same lag. Every sample then corrects the parameters
-once: Ljung, System Identification (1999), section 11.2, with a forgetting factor of 1.
+torque passes through the same filter twice, so that regressor and torque have the same lag. Every sample then corrects
+the parameters once: Ljung, System Identification (1999), section 11.2, with a forgetting factor of 1.
 """
 
 from collections.abc import Sequence
@@ -24,8 +24,9 @@ WARM_UP = 2.0  # cycles of the cut-off frequency until the filters' initial tran
 def fit_recursively(
     recordings: Sequence[Recording], cutoff: float, coulomb_width: float, delay: float = 0.0
 ) -> InverseDynamics:
-    """Fit all `recordings`, one after the other, by RLS, using all joints' torques at every sample, weighted according
-    to their residuals.
+    """Fit all `recordings` by RLS, one after the other.
+
+    At every sample, the torques of all joints are used, weighted according to their residuals.
 
     `cutoff` [Hz], `coulomb_width` [rad/s] and `delay` [s] are as in
     `hil.estimator.baselines.idim.fit_inverse_dynamics`. The weights come from a first pass over the data.

@@ -29,7 +29,7 @@ multiple of the residual with the signs as given, provided that it explains most
 """
 
 MOST_LEFT = 0.5
-QUARTERS = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)  # rad: between the directions from which two angles are measured
+QUARTERS = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)  # rad; angles to try between the zero directions of two joints
 
 _POSITIVE = ("inertia", "viscous", "coulomb")
 _STANDARD_ERRORS = 3.0
@@ -61,8 +61,8 @@ class Signs:
         return f"the sign{plural} of {' and '.join(each for each in listed if each)}"
 
     def fewest(self) -> "Signs":
-        """These signs or the opposite ones, whichever reverse fewer columns: both describe the same motion, since the
-        opposite signs are those of the mirror image of the arm.
+        """These signs or the opposite ones, whichever reverse fewer columns. Both describe the same motion, because
+        reversing all signs mirrors the arm.
         """
         mirrored = Signs(*(tuple(-sign for sign in signs) for signs in (self.torque, self.position)))
         return min(self, mirrored, key=lambda each: len(each.reversed_columns))
@@ -103,7 +103,7 @@ class Suspicion:
 def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
     """Return the reversal that explains the recordings much better than the given signs.
 
-    Returns None if there is none or if filtered inverse dynamics cannot be solved.
+    Returns None if there is no such reversal or if filtered inverse dynamics cannot be solved.
     """
     joints = recordings[0].joints
     given = _fit(recordings, Signs((1,) * joints, (1,) * joints))
@@ -138,7 +138,8 @@ class Absolute:
 
 
 def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = ()) -> Absolute | None:
-    """Return evidence that joint 2's angle is absolute; None if that would not explain the recordings much better.
+    """Return evidence that joint 2's angle is absolute; None if an absolute angle does not explain the recordings much
+    better.
 
     turned: angles [rad] to try adding to the difference, in case the two angles were measured from different
     directions; quarter turns are always tried. If several fit equally well, the first is chosen.
@@ -178,8 +179,8 @@ def _difference(recording: Recording, turned: float) -> Recording:
 def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | None:
     """Return evidence that the torques of two joints are swapped.
 
-    The result is the relative RMS of the worst joint's torque residual, first with the torques swapped, then as given;
-    None if swapping them does not explain the recordings much better.
+    The result is the relative RMS of the worst joint's torque residual, first with the torques swapped, then with the
+    torques as given; None if swapping them does not explain the recordings much better.
     """
     if recordings[0].joints != 2:
         return None
@@ -222,7 +223,10 @@ def _better_explained(recordings: Sequence[Recording], changed: Sequence[Recordi
 
 
 def _combinations(joints: int) -> Iterator[Signs]:
-    """Yield all combinations, fewest reversals first; joint 1's position keeps its sign, to exclude mirrored arms."""
+    """Yield all combinations of signs, those with the fewest reversals first.
+
+    The sign of joint 1's position is never reversed, which excludes mirror images of the arm.
+    """
     every = (
         Signs(torque, (1, *position))
         for torque in product((1, -1), repeat=joints)

@@ -23,12 +23,12 @@ BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
 OUTERMOST = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4])
 """Angles at which to try a mechanical stop, each given as the fraction of samples beyond it."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays to try, in sampling intervals
-DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # total drifts to try, likewise
+DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # total drifts to try
 LATEST = 0.06  # s; largest delay to try between the torque of one joint and those of the others
 FEWEST_STEPS = 2  # least difference between the best delays of two joints, in sampling intervals
 UNEVEN = 0.85  # largest ratio of a joint's residual at its own best delay to that at the other joint's best delay
 EXPLAINED = 0.3  # relative residual of each joint at its best delay, above which the torque does not fit at all
-EVALUATIONS = 30  # maximum number in the search for delay and drift
+EVALUATIONS = 30  # maximum number of evaluations in the search for delay and drift
 MOST_SAMPLES = 30_000  # more would take too long
 
 
@@ -81,7 +81,8 @@ class ClockDrift:
 
 @dataclass(frozen=True)
 class Late:
-    """A joint whose torque column seems to be `delay` [s] later than those of the others; negative if earlier.
+    """A joint whose torque column seems to be `delay` [s] later than those of the other joints; `delay` is negative if
+    it is earlier.
 
     residual, residual_given: relative RMS of the worst joint's torque residual, with the column shifted by `delay` and
     with the column as given.
@@ -95,10 +96,11 @@ class Late:
 
 @dataclass(frozen=True)
 class Uneven:
-    """Two joints whose torques fit their own motion best with different delays.
+    """Two joints whose motions are explained best by different delays of their torques.
 
     late, early: the joints (from 1) with the longest and the shortest delay. by: difference between these delays [s].
-    residual, residual_given: relative RMS of one joint's torque residual, with its own delay and with the other's.
+    residual, residual_given: relative RMS of one joint's torque residual, with its own best delay and with that of the
+    other joint.
     """
 
     late: int
@@ -132,8 +134,8 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
 
 
 def suspect_stop(recordings: Sequence[Recording]) -> Stop | None:
-    """Return the mechanical stop that explains the motion much better than the torque alone or springs would; None if
-    there is none.
+    """Return the mechanical stop that explains the motion much better than springs or the torque alone; None if there
+    is no such stop.
     """
     joints = recordings[0].joints
     given, sprung = _residuals(recordings), _residuals(recordings, _springs)
@@ -189,7 +191,10 @@ def suspect_late(recordings: Sequence[Recording]) -> Late | None:
 
 
 def suspect_uneven(recordings: Sequence[Recording]) -> Uneven | None:
-    """Return two joints with different best delays, each based on the joint's own residual; None if there are none."""
+    """Return two joints whose torques have different best delays; None if there are no such joints.
+
+    Each delay is determined from the joint's own residual.
+    """
     joints = recordings[0].joints
     if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
         return None

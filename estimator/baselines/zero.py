@@ -16,8 +16,8 @@ CUTOFF, WIDTH = 8.0, 0.05  # Hz, rad/s
 EXPLAINED = 0.5  # maximum ratio of the torque residual with free zero angles to that with the given ones
 LEAST = 0.3  # rad; the fit itself can estimate smaller zero errors
 QUARTER, TIE = 0.5 * np.pi, 1.05
-"""Zeros that are multiples of QUARTER [rad] are preferred if their residual is less than TIE times the smallest, since
-a weak or slow motion determines the zero of joint 2 poorly.
+"""Zeros that are multiples of QUARTER [rad] are preferred if their residual is less than TIE times the smallest
+residual, since a weak or slow motion determines the zero of joint 2 poorly.
 """
 SURE = 0.05  # fraction of the largest torque; a weaker gravity torque does not reveal an angle
 
@@ -58,7 +58,8 @@ def turned_zeros(recordings: Sequence[Recording]) -> Array | None:
 
 
 def _half_turns(weights: Array, least: float) -> Array | None:
-    """Return zeros (joints,) [rad], 0 or half a turn, that make gravity torques positive; None if they already are.
+    """Return zeros (joints,) [rad], 0 or half a turn, that make all gravity torques positive; None if they already are
+    positive.
 
     weights: gravity torque of each joint in a horizontal pose (joints,) [N m]; below `least`, its sign is ignored.
     """

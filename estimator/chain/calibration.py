@@ -1,4 +1,4 @@
-"""Torque constants of a spatial arm from a known mass: one fit to a settled period without the mass and one with it.
+"""Torque constants of a spatial arm from a known mass: a single fit to two settled periods, one of them with the mass.
 
 A known mass on a link changes the base parameters by amounts known in kilograms and metres. In units of the first
 joint's assumed torque constant, this change appears multiplied by the ratio of assumed to true constant, which is a
@@ -55,9 +55,9 @@ class ChainCalibration:
     """Ratio of true to assumed torque constant of each joint (joints,)."""
     factor_std: Array
     estimate: ChainEstimate
-    """The fit, in units of the first joint's assumed torque constant."""
+    """The fit, whose values are in units of the first joint's assumed torque constant."""
     value: Array
-    """Parameters `ChainModel.linear_names` of the arm without the mass, scaled to the identified torque constants [SI].
+    """Values of `ChainModel.linear_names` for the arm without the mass, scaled to the identified torque constants [SI].
     """
     std: Array
     residual_steps: Array
@@ -76,8 +76,8 @@ def calibrate_chain(
 ) -> ChainCalibration:
     """Estimate the torque constants of all joints from two settled periods.
 
-    model: a model with `added_mass` and, for several joints, `torque_scale`. prior: a prior without knowledge of the
-    torque constants. Raises ModelError, ConvergenceError.
+    model: a model with `added_mass` and, for several joints, `torque_scale`. prior: a prior that contains nothing about
+    the torque constants. Raises ModelError, ConvergenceError.
     """
     if not model.added_mass or model.torque_scale == (model.joints == 1):
         raise ModelError("a calibration needs a model with added_mass and, for several joints, torque_scale")

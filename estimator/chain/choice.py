@@ -101,7 +101,8 @@ def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, 
 def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) -> float:
     """For unknown noise levels, return twice the gain in log likelihood, less the amount expected by chance.
 
-    The residual's correlation is taken from the richer model, since terms missing from the simpler one are not noise.
+    The residual's correlation is taken from the richer model, since the residual of the simpler one also contains the
+    effects of the missing terms.
     """
     before, after = (np.nansum(np.square(each.residual), axis=1) for each in (simple, rich))
     samples = np.isfinite(simple.residual).sum(axis=1)

@@ -1,5 +1,5 @@
-"""Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, a wrong time
-scale.
+"""Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, and a wrong
+time scale.
 
 As for planar arms (`hil.estimator.baselines.signs`), the torque residual of filtered inverse dynamics with a column
 changed is compared with the residual for the columns as given. Changing the signs and scale factors of torques only
@@ -34,7 +34,7 @@ EQUALLY_FAR = 4.0  # smallest difference in squared distance to the description 
 SIGNIFICANT = 3.0  # standard errors
 FACTORS = np.exp(np.linspace(-np.log(6.0), np.log(6.0), 41))  # torque factors to try
 STEPS = 1.0 + 0.08 * np.linspace(-1.0, 1.0, 17)  # factors by which to refine the best one
-RIDGE = 1e-12  # added to normal equations of unit diagonal, so that they stay nonsingular if a joint hardly moves
+RIDGE = 1e-12  # added to normal equations with unit diagonal to keep them nonsingular if a joint hardly moves
 SWEEPS = 3  # number of sweeps over the joints
 DELAYS = 0.005 * np.arange(-12, 13)  # s: torque delays to try
 LEAST_LATE = 0.01  # s
@@ -48,8 +48,8 @@ class Reversed:
     """Reversed columns.
 
     residuals: relative RMS of the worst joint's torque residual with the change and without it.
-    impossible: whether friction is negative with the columns as given. This happens if all torques are reversed, or the
-    torque or position of a first joint whose axis is vertical.
+    impossible: whether friction is negative with the columns as given. This happens if all torques are reversed, or if
+    the first joint's axis is vertical and its torque or position is reversed.
     """
 
     residuals: tuple[float, float]
@@ -69,7 +69,7 @@ class WrongTimes:
 
 @dataclass(frozen=True)
 class Swapped:
-    """Columns of two joints, counted from 0, that are exchanged. residuals: as for reversed columns."""
+    """Exchanged columns of two joints, which are counted from 0. residuals: as for reversed columns."""
 
     residuals: tuple[float, float]
     joints: tuple[int, int]
@@ -79,7 +79,7 @@ class Swapped:
 
 @dataclass(frozen=True)
 class Late:
-    """Torque logged `seconds` later than it acted, or earlier if negative. residuals: those of the joint's torque."""
+    """Torque that was logged `seconds` after it acted (before, if negative). residuals: those of the joint's torque."""
 
     residuals: tuple[float, float]
     joint: int | None
@@ -92,14 +92,14 @@ class _Solved:
     value: Array
     std: Array
     relative: Array
-    """RMS of the torque residual relative to that of the torque (joints,)."""
+    """RMS torque residual of each joint, relative to the RMS of its torque (joints,)."""
 
     @property
     def worst(self) -> float:
         return float(self.relative.max())
 
     def distance(self, prior: Prior) -> float:
-        """Squared distance between the base parameters and the description's, in units of the prior's standard
+        """Squared distance between the base parameters and those of the description, in units of the prior's standard
         deviations.
         """
         return float(np.sum(np.square((self.value[: prior.value.size] - prior.value) / prior.std)))

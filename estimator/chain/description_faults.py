@@ -1,12 +1,12 @@
-"""Search for a mistake in an arm's description that explains a motion which the description as given does not.
+"""Search for a mistake in an arm's description if a motion contradicts it.
 
-Each joint in turn is given the opposite direction, another zero or another axis, or the base another orientation, and
-the torque residual of filtered inverse dynamics is compared with that of the description as given. As in
+One joint at a time is given the opposite direction, another zero or another axis, or the base is given another
+orientation. The torque residual of filtered inverse dynamics is compared with that of the description as given. As in
 `hil.estimator.chain.simulation.motion_observer`, all parameters have a Gaussian prior, and dry friction can hold a
 joint that hardly moves. A joint near its rest angle may lie against an end stop, so its torque is not compared.
 
-A wrong description is wrong from the start, while a fault of a motor, a gear or an encoder begins. So a change to the
-description must explain the motion before the last `LATEST_S` better as well.
+A wrong description is wrong from the start, while a fault of a motor, a gear or an encoder sets in later. Therefore a
+change to the description must also explain the motion better if its last `LATEST_S` are left out.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,15 +23,17 @@ from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.simulation.motion_observer import STANDING, STATIC
 
 FILTER_S = 0.03  # time constant of each of the three poles
-APART_S = 0.1  # between the samples that are compared
+APART_S = 0.1  # interval between the samples that are compared
 WARM_S = 0.3
 LATEST_S = 0.5
 LEAST_SAMPLES = 15
 ERROR, FRICTION_ERROR = 0.05, 0.3
 """Standard deviation of the torque, relative to a joint's largest torque and to its mean dry friction."""
 BETTER, BETTER_BEFORE = 0.5, 0.7
-"""Largest ratio of the squared residuals, with a change and as given: in the whole motion, and before `LATEST_S`."""
-LEAST_GAIN = 9.0  # smallest decrease in the squared residuals before `LATEST_S`
+"""Largest ratio of the squared residuals with a change to those as given: in the whole motion, and without its last
+`LATEST_S`.
+"""
+LEAST_GAIN = 9.0  # smallest decrease in the squared residuals without the last `LATEST_S`
 WELL = 0.3  # largest mean squared residual with a change
 AS_WELL, AS_WELL_BY = 1.15, 4.0  # ratio and difference of the squared residuals up to which changes are equally good
 MOST_CAUSES = 3  # if more changes explain the motion equally well, none is credible
@@ -52,7 +54,7 @@ class Change:
     turned: float = 0.0
     """Angle to add to the joint's angle, after its direction has been reversed if `kind` is "direction" [rad]."""
     axis: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """The axis in the joint's frame, if `kind` is "axis"; the upward direction in the base's, if it is "base"."""
+    """If `kind` is "axis", the axis in the joint's frame; if it is "base", the upward direction in the base's frame."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class Motion:
         )
 
     def changed(self, change: Change) -> "Motion":
-        """The motion in the angles of the changed description."""
+        """The motion, with angles and torques as defined by the changed description."""
         if change.kind not in ("direction", "zero"):
             return self
         sign = np.ones((len(self.position), 1))
@@ -120,7 +122,7 @@ class Motion:
 
 
 def _smoothed(series: Array, follows: float) -> Array:
-    """Low-pass filter each row, whose first value lasted for ever before."""
+    """Low-pass filter each row as if its first value had applied at all earlier times."""
     from scipy.signal import lfilter
 
     stays = 1.0 - follows
@@ -129,8 +131,8 @@ def _smoothed(series: Array, follows: float) -> Array:
 
 
 def better_descriptions(chain: Chain, known: Known, motion: Motion, rest: Array) -> tuple[Change, ...]:
-    """Return the changes that explain the motion much better than the description as given, the best first; () if there
-    is none, or if too many are equally good.
+    """Return the changes that explain the motion much better than the description as given, the best first. The result
+    is empty if there are no such changes, or if too many are equally good.
 
     rest: angles in the rest pose (joints,) [rad].
     """
@@ -160,7 +162,7 @@ def better_descriptions(chain: Chain, known: Known, motion: Motion, rest: Array)
 
 def _changes(chain: Chain, rest: Array) -> Iterator[Change]:
     for joint in range(chain.joints):
-        # zero_ticks may be right, or the angle at rest.
+        # Either zero_ticks or the rest angle may be right.
         for turned in (2.0 * float(rest[joint]), 0.0):
             yield Change(joint, "direction", turned)
         for turned in ZEROS.tolist():
@@ -190,8 +192,8 @@ def _changed(chain: Chain, change: Change) -> Chain:
 
 
 def _misfit(arm: tuple[BaseParameters, Array, Array], motion: Motion) -> float:
-    """Sum of the squared torque residuals and of the parameters' squared distance from their prior, both in standard
-    deviations, for the best parameters.
+    """Minimum, over the parameters, of the squared torque residuals plus the parameters' squared distance from their
+    prior, both in units of standard deviations.
     """
     base, mean, covariance = arm
     n, samples = motion.position.shape

@@ -40,7 +40,7 @@ SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005
 less than the usual error of a manually adjusted zero.
 """
 
-BELIEVED = 0.5  # largest standard error under white noise, relative to the prior's, of a value that the data determine
+BELIEVED = 0.5  # a value is determined by the data up to this ratio of its white-noise standard error to the prior's
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ AS_GOOD = 0.02  # permitted mean increase of the logarithm of a joint's torque r
 
 @dataclass(frozen=True)
 class Opposed:
-    """A moment with the opposite sign of the described one. link: from 1. All values in kg m."""
+    """A moment whose sign is opposite to that of the described one. link: counted from 1. All values in kg m."""
 
     name: str
     value: float

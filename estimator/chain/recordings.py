@@ -34,7 +34,8 @@ VELOCITY_SAMPLES = 9  # number of samples from which the initial velocity is tak
 
 @dataclass(frozen=True)
 class MotionPiece(SettledPeriod):
-    """A recording resampled at equal intervals for the likelihood of settled periods; its motion need not be periodic.
+    """A recording resampled at equal intervals, to which the likelihood of settled periods is applied although its
+    motion need not be periodic.
 
     The torque before the first sample is assumed to be that of the last sample.
     """

@@ -1,4 +1,4 @@
-"""Fourier coefficients of a settled period, and what follows from them: noise, cut-off, exact derivatives, held
+"""Fourier coefficients of a settled period, and what is computed from them: noise, cut-off, exact derivatives, and held
 commands.
 """
 
@@ -124,7 +124,10 @@ def cut_off(lines: Lines) -> int:
 
 
 def motion_of(lines: Lines, harmonics: int, fundamental: float, samples: int) -> PeriodicMotion:
-    """Return the motion reconstructed from the lines up to `harmonics`, with exact derivatives (j k w0)."""
+    """Return the motion reconstructed from the lines up to `harmonics`.
+
+    The derivatives are exact: each multiplies line k by j k w0.
+    """
     kept = np.zeros_like(lines)
     kept[:, : harmonics + 1] = lines[:, : harmonics + 1]
     turn = 1j * fundamental * np.arange(lines.shape[1])

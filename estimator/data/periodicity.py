@@ -11,13 +11,13 @@ from hil.estimator.arrays import Array
 from hil.estimator.errors import ShapeError
 
 EVEN = 1.1  # maximum ratio of successive changes in a decreasing sequence
-SLOWEST = 0.97  # largest mean ratio of successive changes that still counts as decreasing
+SLOWEST = 0.97  # mean ratio of successive changes up to which they count as decreasing
 SLOWLY = 0.65  # minimum ratio of successive changes while friction warms up, which takes many periods
 WARMEST = 0.25  # largest change from period to period while friction warms up
 ALIKE = (
     0.8  # minimum correlation of successive changes while friction warms up, as it always changes in the same direction
 )
-MOST_PERIODS = 100  # largest number of periods that is advised
+MOST_PERIODS = 100  # largest number of periods to recommend
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def settling_difference(former: Array, latest: Array) -> float:
 class Decay:
     """A change from period to period that decreases by about the same factor each time.
 
-    ratio: that factor. further: number of further periods until the change is within tolerance.
+    ratio: factor between successive changes. further: number of further periods until the change is within tolerance.
     """
 
     ratio: float
@@ -102,8 +102,8 @@ def correlation_of_changes(position: Array) -> float:
     """Return the correlation of a period's change with the previous change; -1 for opposite changes.
 
     position: the three latest periods (3, joints, samples) [rad]. Only the joint whose motion changes most, relative to
-    that motion, is considered. As in `settling_difference`, only the second halves are compared. NaN if nothing can be
-    compared.
+    that motion, is considered. As in `settling_difference`, only the second halves are compared. The result is NaN if
+    nothing can be compared.
     """
     half = position[:, :, position.shape[2] // 2 :]
     changes = np.diff(half, axis=0)

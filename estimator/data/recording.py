@@ -25,7 +25,7 @@ MOST_TORQUE = 1e4  # N m
 
 @dataclass(frozen=True)
 class Recording:
-    """Torque and position of an arm in arbitrary motion: ramps, swing-ups, recordings from other tools.
+    """Torque and position of an arm in arbitrary motion: ramps, swing-ups, or recordings from other tools.
 
     Missing positions are NaN. Raises ShapeError for incompatible arrays; RecordingError for times that do not increase,
     non-finite values, gaps, and values that are implausible in SI units; StandstillError for a joint that moved by only

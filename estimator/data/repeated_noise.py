@@ -167,8 +167,8 @@ def _power(difference: Array) -> Array:
 def _not_drifted(difference: Array, differs: Array) -> Array:
     """Return the fraction (joints, orders) of each order of the rounding error that repeats despite drift.
 
-    difference: difference of two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,). The
-    estimated drift contains noise, a fraction of `differs`; its effect is divided out.
+    difference: difference of two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,). The estimated
+    drift contains noise, whose power is a fraction of `differs`; the effect of this noise is divided out.
     """
     filled = _filled(difference)
     closed = without_jump(filled)
@@ -180,7 +180,7 @@ def _not_drifted(difference: Array, differs: Array) -> Array:
 
 
 def _repeating(differs: float, kept: Array) -> float:
-    """Return the repeating power of the rounding error [steps^2].
+    """Return the power of the repeating part of the rounding error [steps^2].
 
     differs: half the mean square of the difference [steps^2]. kept: fraction of each order that drift leaves (orders,).
     """

@@ -193,7 +193,7 @@ class _Posed:
         return np.concatenate((self.coordinates.coordinates(value), self._altered.offsets, unknowns))
 
     def minimum(self, shared: Array, own: Array, ftol: float = OPTIONS.ftol_refine) -> Segmented:
-        """Fit from these coordinates. Raises ConvergenceError."""
+        """Fit, starting from these coordinates. Raises ConvergenceError."""
         extra = np.zeros(self.unknowns)
         known = self._altered.problem.expected(self.coordinates, shared[: shared.size - self.unknowns], own)
         prior = Expected(np.concatenate((known.centre, extra)), np.concatenate((known.precision, extra)), known.weight)

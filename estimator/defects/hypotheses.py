@@ -67,7 +67,7 @@ class Hypothesis:
 def hypotheses(
     recordings: Sequence[Recording], segments: Sequence[RecordingSegment], values: Mapping[str, float], gravity: bool
 ) -> list[Hypothesis]:
-    """Return all defects to test. values: parameters by name [SI]; gravity: whether it acts on the arm."""
+    """Return all defects to test. values: parameters by name [SI]. gravity: whether gravity acts on the arm."""
     joints = recordings[0].joints
     always = np.ones(len(segments))
     # Without gravity, the scale of the first joint's angle cannot be separated from that of its inertia and friction.
@@ -109,14 +109,14 @@ def _changes(
 
 
 def _load(joints: int) -> tuple[Direction, ...]:
-    """Return the effects of a mass on the last link; its first moment scales gravity_2 and coupling by one factor."""
+    """Return the effects of a mass on the last link; its first moment scales gravity_2 and coupling equally."""
     if joints == 1:
         return ({"inertia_1": 1.0}, {"gravity_1": 1.0})
     return ({"inertia_1": 1.0}, {"gravity_1": 1.0}, {"gravity_2": 1.0, "coupling": 1.0}, {"inertia_2": 1.0})
 
 
 def _torque_gain(joint: int, values: Mapping[str, float]) -> Direction:
-    """Return the effect of a torque above the recorded one.
+    """Return the effect of a torque that is larger than recorded.
 
     Joint 1's torque is the reference: if it was larger than recorded, all other values appear smaller.
     """

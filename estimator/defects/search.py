@@ -173,7 +173,7 @@ class _Linear:
         return float(self.samples.sum()) / self.colour
 
     def score(self, altered: Altered, hypothesis: Hypothesis, tried: int) -> _Score:
-        """Return the score test of a hypothesis; tried: number of hypotheses tested."""
+        """Return the result of the score test of a hypothesis; tried: number of hypotheses tested."""
         base = np.eye(self.gradient.shape[1])[:, self.fitted]
         added = _added(hypothesis, altered, len(base))
         before = self._fall(base, None, hypothesis)

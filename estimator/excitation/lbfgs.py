@@ -23,8 +23,9 @@ _sum: Callable[[Array], Any] = np.add.reduce  # np.sum takes three times as long
 
 
 def descend(function: Function, x: Array, steps: int) -> Array:
-    """Minimise `function`, which returns its value and gradient, in at most `steps` steps from `x`; return the last
-    `x`.
+    """Minimise a function from `x` in at most `steps` steps; return the last `x`.
+
+    `function` returns its value and its gradient.
 
     Steps are rounded to a grid. Otherwise the last bit of a cosine, which depends on the processor, might lead to
     another minimum.

@@ -82,7 +82,7 @@ def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tup
 
 
 def detecting_lines(period: float, band: tuple[float, float], joints: int, seed: int) -> tuple[tuple[int, ...], ...]:
-    """Assign odd harmonics to the joints in turn, leaving one of every DETECTION, chosen at random (`seed`), unexcited.
+    """Assign odd harmonics to the joints in turn, but leave one line in every DETECTION unexcited, chosen at random.
 
     On the unexcited lines, odd or even, the arm's nonlinear distortion becomes visible: see
     `hil.estimator.selection.distortion`. Raises ExcitationError if fewer lines than joints are left.

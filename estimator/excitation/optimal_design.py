@@ -76,7 +76,7 @@ class DesignProblem:
     def worst(self, wave: Multisine) -> float:
         """Return the largest relative standard error of `names` from a settled period of `wave`.
 
-        It is infinite if the period does not determine all of them.
+        The result is infinite if the period does not determine all of these parameters.
         """
         deviations = self.standard_errors(wave)
         return float((deviations / self.scale()).max())
@@ -97,8 +97,8 @@ class DesignProblem:
         return deviations
 
     def scale(self) -> Array:
-        """Return the divisor of each standard error: the parameter or, for an offset, the joint's Coulomb friction
-        [SI].
+        """Return the values by which standard errors are divided: the parameters or, for offsets, the joints' Coulomb
+        friction [SI].
         """
         known = dict(zip(CONSTANTS, self.physics.vector.tolist(), strict=True))
         against = [name.replace("offset", "coulomb") if name.startswith("offset") else name for name in self.names]

@@ -61,7 +61,7 @@ def _share_until_bound(step: Array, direction: Array, least: Array, most: Array)
 
 
 def _wrongly_held(slope: Array, step: Array, most: Array, held: Mask, tolerance: float) -> int | None:
-    """Return the held coordinate along which the function decreases fastest away from its bound, or None."""
+    """Return the held coordinate along which the function decreases fastest away from its bound, if there is one."""
     inwards = np.where(step >= most, slope, -slope)
     inwards = np.where(held, inwards, -np.inf)
     best = int(np.argmax(inwards))

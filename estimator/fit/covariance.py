@@ -136,7 +136,7 @@ def robust_covariance(
 def is_unpredictable(at: Quadratic, samples: int) -> bool:
     """Return whether the motion is so sensitive that its derivatives are valid only for extremely small changes.
 
-    The standard errors would then be tiny and meaningless. Coordinates are of order 1.
+    If so, the computed standard errors are tiny and meaningless. Coordinates are of order 1.
     """
     return bool(np.max(np.diag(at.normal), initial=0.0) > (samples * SENSITIVE**2))
 
@@ -202,7 +202,8 @@ def by_parameters(covariance: Array, slopes: Array, value: Array) -> Array:
     """Return the covariance of the parameters (parameters, parameters) from that of their coordinates.
 
     A positive parameter that has run into its floor is practically zero, and its own value serves as its standard
-    error. The slope reveals this: it is the distance from the floor, whose logarithm is the coordinate.
+    error. Such a parameter is recognised by its slope, which equals the distance from the floor, since the coordinate
+    is the logarithm of this distance.
     """
     hidden = np.isinf(np.diag(covariance))
     finite: Array = slopes @ np.where(np.isfinite(covariance), covariance, 0.0) @ slopes.T

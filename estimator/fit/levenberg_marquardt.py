@@ -133,7 +133,7 @@ class _Trials:
     _latest: tuple[Array, Quadratic] | None = None
 
     def improve(self, damping: float, options: MinimiserOptions) -> tuple[tuple[Array, Quadratic] | None, float]:
-        """Return a better point or None, and the damping for the next step."""
+        """Return a better point (None if there is none) and the damping for the next step."""
         while damping < options.max_damping:
             moved, foreseen = self._moved(damping)
             if foreseen < self.ftol * self.at.cost:

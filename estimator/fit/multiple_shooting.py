@@ -36,7 +36,7 @@ DEFAULTS = ShootingOptions()
 ALL = slice(None)
 MOST_WEIGHT = 1e9
 ENOUGH = 1.25  # minimum number of samples in a short segment, relative to FEWEST
-MOST_SHORT = 0.6  # short segments are not tried if they had to be longer than this fraction of a segment
+MOST_SHORT = 0.6  # short segments are not tried if they would have to be longer than this fraction of a segment
 
 
 @dataclass(frozen=True)
@@ -304,7 +304,7 @@ def estimate_by_shooting(
             `hil.estimator.baselines.idim`.
         length: nominal length of a segment [s].
         zeros: whether to estimate the encoders' zero errors too, one per joint and recording, for servos whose zero
-            changes at every start. They can only be determined with gravity.
+            changes at every start. The zeros can only be determined if gravity acts on the arm.
         of: which segments of each recording to fit; the others are left for validation.
         near: an estimate from another model or from other segments of the same recordings, used as the only initial
             guess.
@@ -342,7 +342,7 @@ def estimate_by_shooting(
 def _from_guesses(
     short: Shooting, long: Shooting, coordinates: Coordinates, model: Model, start: Array, options: ShootingOptions
 ) -> Array:
-    """Return the best fit's shared coordinates from several guesses, as Stribeck friction causes local minima."""
+    """Fit from several guesses, since Stribeck friction causes local minima; return the best shared coordinates."""
     ends: list[Segmented] = []
     lost: list[ConvergenceError] = []
     for x in _initial_guesses(short, coordinates, model, start, options):

@@ -58,7 +58,7 @@ class Search:
     """The objective with coarse integration steps."""
     options: LikelihoodOptions
     coarse: bool
-    """Whether to end fits before full convergence if the residual is well above the noise; this suffices to compare
+    """Whether to end fits before full convergence if the residual is well above the noise; such fits suffice to compare
     models.
     """
 
@@ -88,8 +88,8 @@ class Search:
         return self._undisguised(refined, replace(minimum, iterations=spent))
 
     def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
-        """Replace Stribeck rises that hardly fall in this motion with Coulomb friction, unless the fit becomes
-        significantly worse.
+        """Replace Stribeck friction that hardly varies with speed in this motion by Coulomb friction, unless the fit
+        becomes significantly worse.
         """
         if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
             return refined, minimum
@@ -230,7 +230,7 @@ class Search:
     def _at_once(self, fits: Sequence[Callable[[], Minimum]]) -> list[Minimum]:
         """Run independent fits in threads; compiled code releases the GIL.
 
-        Fits that do not converge are ignored if any other does; otherwise, ConvergenceError is raised.
+        Fits that do not converge are ignored if at least one fit converges; otherwise, ConvergenceError is raised.
         """
         found: list[Minimum] = []
         lost = ConvergenceError("no fit was started")

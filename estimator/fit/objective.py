@@ -129,7 +129,7 @@ class Objective:
         return least, most
 
     def cost_at(self, x: Array) -> float:
-        """Return the weighted sum of squares at `x`, in a fraction of the time of `evaluate`."""
+        """Return the weighted sum of squares at `x`; this takes a fraction of the time that `evaluate` takes."""
         physics = self.physics(x)
         if not np.all(np.isfinite(physics.vector)):
             return np.inf

@@ -165,7 +165,7 @@ class Coordinates:
 
     @cached_property
     def _shares(self) -> list[tuple[int, int, int]]:
-        """Index triples: a parameter, and the two others whose geometric mean bounds it."""
+        """Index triples: a parameter, then the two parameters whose geometric mean bounds it."""
         shares = []
         for share, name in enumerate(self.names):
             bounds, joint = term_of(name).share_of, joint_of(name)
@@ -191,7 +191,7 @@ class CoordinatePrior:
         spread = np.array([np.inf if term.spread is None else sizes.of(term.spread) for term in terms])
         signed = np.array([term.range == "any" for term in terms])
         absent = np.array([term.absent for term in terms])
-        # For small deviations from its absent value, the logarithm of a factor changes like the factor itself.
+        # Near the value at which a factor has no effect, its logarithm changes as fast as the factor itself.
         centre = np.where(signed, absent / scales, np.log(np.where(signed | (absent <= 0.0), 1.0, absent)))
         precision = (np.where(signed, scales, absent) / spread) ** 2
         for index, term in enumerate(terms):

@@ -1,8 +1,8 @@
 """The narrowest smoothed Coulomb step that a simulation resolves.
 
 On a light arm, friction stops a joint within microseconds, which limits the width that can be resolved. A step narrower
-than that has no visible effect in any recording, but the simulation jumps back and forth across it, which makes the
-derivatives meaningless.
+than this limit has no visible effect in any recording, but the simulation jumps back and forth across it, which makes
+the derivatives meaningless.
 """
 
 from collections.abc import Mapping, Sequence

@@ -19,7 +19,7 @@ from hil.estimator.options import SegmentedMinimiserOptions
 from hil.estimator.threads import thread_count
 
 Residual = Callable[[int, Array, Array], Array]
-"""Returns the residuals (rows,) of one segment at the shared coordinates (shared,) and its own (own,)."""
+"""Returns the residuals (rows,) of one segment for the shared coordinates (shared,) and the segment's own (own,)."""
 
 Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
 """Returns the residuals of one segment as `Residual` does, and their derivatives with respect to the shared and then
@@ -27,13 +27,14 @@ the segment's own coordinates (rows, shared + own).
 """
 
 _Step = tuple[Array, Array]
-"""A step of the shared coordinates (shared,) and of the segments' own (segments, own), or coordinates after one."""
+"""A step in the shared coordinates (shared,) and in the segments' own (segments, own), or the coordinates after a step.
+"""
 
 DEFAULTS = SegmentedMinimiserOptions()
 MIN_SEGMENTS = 3
 CURVATURE_STEP = 0.1  # fraction of a step over which the curvature of the residuals is measured
 MOST_ACCELERATION = 0.75  # length of the acceleration relative to that of the step
-MIN_EIGENVALUE = 1e-12  # relative to the largest; directions below have no effect on the residual
+MIN_EIGENVALUE = 1e-12  # relative to the largest; directions with smaller ones have no effect on the residual
 MIN_PART = 1e-4  # squared component of a coordinate in such a direction; anything smaller is rounding error
 
 
@@ -223,14 +224,15 @@ def minimise_segmented(
 ) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt with geodesic acceleration.
 
-    `residual` and `derivative` are called from several threads; their number does not affect the result.
+    `residual` and `derivative` are called from several threads; the number of threads does not affect the result.
 
     Args:
         residual: returns the residuals of a segment.
         derivative: returns the residuals of a segment and their derivatives.
         shared: initial shared coordinates (shared,), of order 1.
         own: initial coordinates of each segment (segments, own), of order 1.
-        ftol: stop when the relative decrease in one step is below this; after a failed step, in two steps.
+        ftol: stop when the relative decrease in a step is below this; if damping had to be raised, only after two such
+            steps in a row.
         options: limits of the iteration.
         expected: prior on the shared coordinates.
         move: applies a step to the shared coordinates.
@@ -319,7 +321,7 @@ def _step(
     """Return a damped step; if `is_curved`, with geodesic acceleration (Transtrum and Sethna, 2012, arXiv:1201.5885).
 
     The acceleration makes the step follow curved valleys of the sum of squares, such as that of the encoder zeros of a
-    small motion. It is omitted unless it is small compared with the step. after: returns the coordinates and the
+    small motion. It is used only if it is small compared with the step. after: returns the coordinates and the
     residuals after a step.
     """
     step = equations.solved(equations.residual, equations.pull, damping)

@@ -52,7 +52,7 @@ def fit_lines(*periods: SettledPeriod, options: LinearOptions = DEFAULTS) -> Lin
     """
     joints = periods[0].joints
     if any(period.joints != joints for period in periods):
-        raise ShapeError(f"the periods have {[period.joints for period in periods]} joints: all must be from one arm")
+        raise ShapeError(f"the periods have {[period.joints for period in periods]} joints: they must be of one arm")
     lines = [lines_of(period.filled()) for period in periods]
     harmonics = tuple(map(cut_off, lines))
     motions = tuple(

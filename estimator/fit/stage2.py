@@ -88,7 +88,8 @@ def fit_runs(
         periods: settled periods of one arm.
         model: the model to fit.
         linear: stage 1's estimate for the same periods.
-        coarse: whether to end the fit early if the residual is well above the noise; this suffices to compare models.
+        coarse: whether to end the fit early if the residual is well above the noise; such a fit suffices to compare
+            models.
         starts: additional initial guesses, parameters by name [SI], tried before all others.
         near: point known to be close to a minimum, used as the only initial guess.
         options: tolerances and limits.
@@ -269,7 +270,7 @@ def _fit(
     options: LikelihoodOptions,
     ftol: float | None = None,
 ) -> Fit:
-    """Return the fit at `minimum` or, if `ftol` is given and reweighted priors move it, at the new minimum."""
+    """Return the fit at `minimum`, or at the new minimum if `ftol` is given and reweighting the priors moves it."""
     objective, x, count = refined.weighted, minimum.x, refined.weighted.count
     positions = objective.positions(x)
     errors = _errors(periods, objective, x, positions, options)
@@ -318,9 +319,9 @@ def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Arr
 def _doubting(objective: Objective, minimum: Minimum, errors: _Errors) -> Objective:
     """Return the objective, with a wider prior on the length of link 1 if the motion contradicts that prior.
 
-    Without this, a wrong length would practically determine the coupling in a small motion: the motion's own estimate
-    differs from what this length implies by little more than its standard error. The prior's variance is increased
-    until a difference of this size is typical.
+    In a small motion, a wrong length would otherwise practically determine the coupling, because the estimate from the
+    motion alone differs from the value implied by the length by little more than its standard error. The prior's
+    variance is increased until a difference of this size is typical.
     """
     lever = objective.lever
     if lever is None or lever.is_doubted:
@@ -369,7 +370,8 @@ def _tempered(
 def _model_error(residual: Array, weight: Array, period: SettledPeriod) -> Array:
     """Return the part of each joint's weighted sum of squares that is due to model errors (joints,).
 
-    This is the part that is not white, limited to the excess over the noise, since slow joints' rounding is not white.
+    This is the part that is not white, limited to the excess over the noise, since the rounding errors of slow joints
+    are not white either.
     """
     squares = np.sum(residual**2, axis=1)
     noise = np.sum((weight * period.noise[:, None]) ** 2, axis=1)

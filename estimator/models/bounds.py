@@ -36,7 +36,7 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
 
     The standard errors are those for independent errors with variance 1. normal (coordinates, coordinates), gradient
     (coordinates,): normal matrix and gradient of the sum of squares. slopes: derivatives of the parameters with respect
-    to their coordinates, which come first (parameters, parameters).
+    to their coordinates (parameters, parameters); these come before all other coordinates.
     """
     inverse, scale = scaled_inverse(normal)
     count = len(slopes)

@@ -80,7 +80,7 @@ def describe(past: Any, j: int, count: int, noise: float, friction: float) -> No
 
 
 def store(past: Any, theta: Any, covariance: Any) -> None:
-    """Store the current moment with the parameters `theta` and their `covariance`."""
+    """Store the current moment (the sums so far) with the parameters `theta` and their `covariance`."""
     count, head = theta.size, past[_SLOTS + 1]
     row = past[int(head[_NEXT])]
     at = 1 + 2 * (_ROW + count) + 4
@@ -129,7 +129,9 @@ def compare(past: Any, j: int, back: int, count: int, floor: float, rounding: fl
 
 
 def keep(past: Any, j: int, mean: float) -> None:
-    """Process the result of joint `j`'s comparisons: a mean residual, or 0 if the earlier model explains it."""
+    """Process the result of joint `j`'s comparisons: a mean residual torque, or 0 if the earlier models explain the
+    torque.
+    """
     head = past[_SLOTS + 1]
     head[_LASTS + j] = head[_LASTS + j] + 1.0 if mean != 0.0 else 0.0
     head[_FOUND + j] = mean if head[_LASTS + j] >= IN_A_ROW else 0.0

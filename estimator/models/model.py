@@ -44,8 +44,8 @@ class Model:
         ripple: multiplies the motor torque by 1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q),
             where ripple_cycles is the number of cycles per turn of the joint.
         cogging: adds cogging_sin sin(cogging_cycles q) + cogging_cos cos(cogging_cycles q) to the torque.
-        zeros: adds zero errors of the encoders, true angle = measured angle + zero; the first joint's is observable
-            only under gravity.
+        zeros: adds zero errors of the encoders, true angle = measured angle + zero; the zero of the first joint is
+            observable only under gravity.
         torque_scale: multiplies the second joint's torque by the ratio of true to assumed torque constant relative to
             the first joint's.
         saturation: reduces the torque by the fraction saturation torque^2.
@@ -54,7 +54,8 @@ class Model:
             encoder_sin_twice sin 2q + encoder_cos_twice cos 2q.
         lags: adds lag_difference to the lag of the second joint's torque or, without a lag, to its delay.
 
-    Raises ModelError for an unknown name, for torque_scale with one joint, and for arms without one or two joints.
+    Raises ModelError for an unknown name, for torque_scale with one joint, and for arms that do not have one or two
+    joints.
     """
 
     joints: int

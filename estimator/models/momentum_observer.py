@@ -12,12 +12,12 @@ of arms, and are updated with each sample (recursive least squares, that is, a K
 slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as the arm moves.
 
 A joint's residual torque is the part of its torque that the motion does not account for. An alarm is raised if it
-exceeds three thresholds for `HOLD_S` (or for less if it far exceeds them): `TIMES` standard deviations of the
+exceeds three thresholds for `HOLD_S` (or for a shorter time if it far exceeds them): `TIMES` standard deviations of the
 uncertainty due to parameters and noise, the torque that friction can balance while the joint stands still, and a
 fraction of the largest planned torque. The noise is estimated as well, so that effects that the model lacks (Stribeck
 friction, backlash, flexibility) widen the admissible range. A deviation that could lead to an alarm is only included in
 this estimate once it has subsided without causing an alarm. Otherwise, if something held a joint for a long time, the
-range would widen until nothing exceeded it. A lower noise is assumed while a joint stands still, since most noise
+range would widen until nothing exceeded it. A lower noise level is assumed while a joint stands still, since most noise
 arises only in motion.
 
 Once a joint's angle has stayed within its gear's play for `_STAYS_S`, the reported velocity does not show in which
@@ -51,7 +51,8 @@ NAMES = (
     *("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
     *("viscous_1", "viscous_2", "coulomb_1", "coulomb_2", "offset_1", "offset_2", "tilt_1", "tilt_2"),
 )
-"""Names of the parameters. The tilts are gravity torques that follow the sines of the angles, due to a tilted base."""
+"""Names of the parameters. The tilts are the gravity torques of a tilted base that vary with the sines of the angles.
+"""
 
 FILTER_S = 0.02
 HOLD_S = 0.05
@@ -156,7 +157,7 @@ class MomentumObserver:
         )  # compiles the loop and initialises the memory
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:
-        """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1.
+        """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1 if there is none.
 
         position: angles [rad]. velocity: velocities [rad/s]. torque: torques commanded since the previous sample [N m].
         seconds: time since the previous sample [s].
@@ -406,8 +407,8 @@ def _look_back(
     rounding: float,
     dt: float,
 ) -> float:
-    """Process joint j's sample; return its mean residual torque if the earlier model has failed to explain it for long
-    enough, otherwise 0.
+    """Process joint j's sample; return its mean residual torque if the earlier model has failed to explain the torque
+    for long enough, otherwise 0.
 
     stands: filtered indicator of standstill. friction: static friction [N m]. rounding: variance of the residual.
     """

@@ -14,7 +14,7 @@ CONSTANTS = constants()
 ABSENT = {name: term_of(name).absent for name in CONSTANTS}
 """Values that disable terms missing from the model; a one-joint arm gets a second joint that moves freely."""
 ENCODER = tuple(name for name, term in TERMS.items() if term.part == "encoder")
-"""Terms that describe encoder errors periodic over a turn."""
+"""Terms that describe encoder errors that repeat with every turn."""
 LEAST_LAG = 1e-6  # s
 SLIDING = 0.05  # rad/s: velocity above which a joint slides, with its bristles deflected in the direction of motion
 
@@ -24,8 +24,8 @@ LEAST_INERTIA = 0.2
 
 
 def place_of(term: str) -> int:
-    """Return the index of a term's constant in `Physics.vector`. For a term with one constant per joint, this is joint
-    1's index; joint 2's follows.
+    """Return the index of a term's constant in `Physics.vector`. If the term has one constant per joint, this is the
+    index for joint 1; the index for joint 2 is the next.
     """
     return CONSTANTS.index(term if TERMS[term].scope == "arm" else f"{term}_1")
 
@@ -81,7 +81,7 @@ class Physics:
 
     @property
     def lags(self) -> Array:
-        """Time constant of each joint's lag (2,) [s]; joint 2's stays above 0 if there is any lag."""
+        """Time constant of each joint's lag (2,) [s]; that of joint 2 stays above 0 if the drives have a lag."""
         return np.array([self.lag, max(self.lag + self.lag_difference, LEAST_LAG) if self.lag > 0.0 else 0.0])
 
     @property

@@ -2,7 +2,7 @@
 
 Torque and position determine six combinations of ten quantities (for one joint, two combinations of four). Each known
 length, mass or rotor inertia reduces the unknowns by one. A quantity without a component in the null space of the
-equations is determined; the others form inseparable groups.
+equations is determined; the other quantities form inseparable groups.
 """
 
 from collections.abc import Mapping

@@ -8,8 +8,8 @@ modelled.
 
 A torque outside the band accelerates a free joint. The joint counts as blocked once the motion of a free joint would
 show in the velocity register. Twice the momentum of that motion is required, because as long as the position of the
-band is unknown, only half of the excess is certain to act on the joint. If a joint moves again, friction had been
-holding it; a torque range that it has withstood in this way never raises an alarm again.
+band is unknown, only half of the excess is certain to act on the joint. If a joint moves again, it had been held by
+friction; a torque range that it has withstood in this way never raises an alarm again.
 
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """

@@ -104,8 +104,8 @@ class Term:
     either sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of the two terms whose geometric mean bounds this term. If each joint has this term, both belong to the
-    same joint.
+    """Names of the two terms whose geometric mean bounds this term. If each joint has this term, the two terms are
+    those of the same joint.
     """
     scale: Scale | float = 1.0
     """Typical change during a fit: a number [unit], or the name of a scale that depends on the arm and its motion."""
@@ -116,8 +116,8 @@ class Term:
     fastest: float | None = None
     """Upper bound of a term that is a speed, as a multiple of the joint's highest speed; None for no bound.
 
-    A Stribeck rise that never falls is Coulomb friction, and a Coulomb step that is never completed is viscous
-    friction.
+    Beyond it, a Stribeck rise would be nearly constant, like Coulomb friction, and a Coulomb step nearly linear in
+    velocity, like viscous friction.
     """
     largest: float | None = None
     """Upper bound [unit]; None for no bound.
@@ -290,7 +290,7 @@ _DECLARED = (
     Term(
         "lag_difference",
         "s",
-        "additional lag of the joint's torque relative to joint 1's; without lag, additional delay",
+        "additional lag of the joint's torque relative to joint 1's; without a lag, additional delay",
         part="lags",
         first_joint=2,
         range="any",
@@ -368,7 +368,7 @@ def base_names(joints: int) -> tuple[str, ...]:
 def extra_names(
     joints: int, parts: frozenset[str] | None = None, by_voltage: frozenset[int] | None = None
 ) -> tuple[str, ...]:
-    """Return the names of a model's parameters except the base parameters; parts: its parts, by default all.
+    """Return the names of a model's parameters except the base parameters; parts: parts of the model, by default all.
 
     by_voltage: joints (from 1) that are driven by voltage; by default all.
     """

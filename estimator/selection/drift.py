@@ -1,9 +1,9 @@
 """Changes in friction during motion: as grease warms up, friction falls by a few percent within minutes.
 
-A fit of one period, or of the mean of several, is valid for the middle of their time span. Other periods then show
-whether friction was larger or smaller: the difference in motion is nearly linear in one factor per joint, which
-multiplies viscous and dry friction, and in the period's initial state. Alternatively, a constant torque in only one of
-the periods may have caused the difference.
+A fit of one period, or of the mean of several periods, is valid for the middle of the time that it covers. Other
+periods then show whether friction was larger or smaller: the difference in motion is nearly linear in one factor per
+joint, which multiplies viscous and dry friction, and in the period's initial state. Alternatively, a constant torque in
+only one of the periods may have caused the difference.
 """
 
 from collections.abc import Sequence

@@ -32,7 +32,7 @@ def fit_given(
     """Return the best fit of `model` to `period`.
 
     starts: additional initial guesses as in `hil.estimator.identify.identify`.
-    Raises the errors of `identify`.
+    Raises the same errors as `identify`.
     """
     waves = [wave for wave in WAVES if wave in model.options]
     try:
@@ -61,8 +61,8 @@ def _with_wave(
     """Return the best fit of the estimate's model with `wave` added, starting from the most likely numbers of cycles
     per turn.
 
-    A wave is most visible in the residual of the fit that explains the most, even if its terms partly imitate the wave;
-    that fit is used only for the search.
+    A wave is most visible in the residual of the fit that explains the most, even if the terms of that fit partly
+    imitate the wave; such a fit is used only for the search.
     """
     model, joints = estimate.model.having(wave), range(1, estimate.model.joints + 1)
     rich = replace(estimate.model, friction=FRICTIONS[-1]).having("zeros", *SMOOTH)

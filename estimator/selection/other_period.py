@@ -19,7 +19,7 @@ def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
     contain the end of a transient, and then uses only the torque. If the earlier state is not known, the arm is
     simulated from rest until its motion repeats.
 
-    Raises PeriodicityError if it never repeats.
+    Raises PeriodicityError if the simulated motion never repeats.
     """
     if other.before is not None:
         return _from_before(Physics.of(estimate.parameters), other, other.before)

@@ -49,7 +49,10 @@ def pruned_model(
 
 
 def removable_parts(model: Model) -> list[tuple[str, Model]]:
-    """Return the removable parts of a model, each with the reduced model; presliding has no significance test."""
+    """Return the removable parts of a model, each with the model without it.
+
+    Presliding is not included, since there is no significance test for it.
+    """
     parts: list[tuple[str, Model]] = [
         (option, model.without(option)) for option in sorted(model.options) if option != "presliding"
     ]

@@ -209,7 +209,7 @@ def _predicted(held_out: Array | None, length: float) -> str:
 
 
 def _is_at_bound(estimate: ShootingEstimate, name: str) -> bool:
-    """Return whether `name` is an inertia that ended at 0, which leaves its fit no slope to return along."""
+    """Return whether `name` is an inertia that ended at 0, from which no fit returns since the slope is zero there."""
     values = dict(zip(estimate.names, estimate.value.tolist(), strict=False))
     inertias = [value for each, value in values.items() if kind_of(each) in INERTIAS]
     return kind_of(name) in INERTIAS and values[name] < ZERO_INERTIA * max(inertias)

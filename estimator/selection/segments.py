@@ -1,4 +1,6 @@
-"""Validation of fits to segments: missing terms, standard errors that allow for them, prediction of held-out motion."""
+"""Validation of fits to segments: missing terms, standard errors that allow for them, and prediction of held-out
+motion.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -52,8 +52,8 @@ def choose(
     saturation, cables, encoder nonlinearity. Added one by one, each would absorb the effects of those still missing;
     added together, with typical sizes as a prior, they can be separated. Then presliding friction and torque ripple are
     tried, and finally insignificant terms are removed. A model that predicts `held_out` worse than a simpler one is not
-    chosen. If friction differs between the two recordings, it has also changed within each; this is corrected
-    (`hil.estimator.selection.steadied`).
+    chosen. If friction differs between `periods` and `held_out`, it has also changed within each; this change is
+    corrected (`hil.estimator.selection.steadied`).
 
     Args:
         periods: settled periods of one arm to be fitted; the first is used to find missing terms.

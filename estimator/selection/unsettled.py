@@ -76,7 +76,7 @@ def choose_by_shooting(
     torque_scale: bool = False,
     options: SelectionOptions = DEFAULTS,
 ) -> SegmentChoice:
-    """Fit friction with the terms that the recordings support.
+    """Fit a friction model with the terms that the recordings support.
 
     Arguments as for `estimate_by_shooting`. torque_scale: whether to fit the ratio of the torque constants even if the
     recordings do not support it.
@@ -103,7 +103,7 @@ def choose_by_shooting(
 
 
 def held_out_error(recordings: Sequence[Recording], estimate: ShootingEstimate, start: Array) -> Array | None:
-    """Fit the estimate's model to alternate segments and return its prediction error on the others (joints,).
+    """Fit the estimate's model to alternate segments and return its prediction error on the remaining ones (joints,).
 
     The error is the RMS error relative to the motion's RMS. Returns None if the fit does not converge or no recording
     has two segments. start: initial guess as in `estimate_by_shooting`.

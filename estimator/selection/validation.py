@@ -49,7 +49,7 @@ class Validation:
     Lags of 1 to LAGS samples are used.
     """
     free_run: Array | None
-    """RMS error of simulating the fitted period from rest, relative to the motion's RMS (joints,).
+    """RMS error of a simulation of the fitted period from rest, relative to the motion's RMS (joints,).
 
     None if the simulation does not settle.
     """
@@ -72,7 +72,7 @@ class Validation:
 
 
 def validate(period: SettledPeriod, estimate: Estimate, gravity: bool = True) -> Validation:
-    """Check `estimate` against the period to which it was fitted. gravity: whether it acts in the arm's plane."""
+    """Check `estimate` against the period to which it was fitted. gravity: whether gravity acts in the arm's plane."""
     residual = np.nan_to_num(estimate.residual)
     lags = min(LAGS, period.samples // 4)
     band = 1.96 / np.sqrt(period.samples)

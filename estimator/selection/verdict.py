@@ -49,7 +49,8 @@ AT_ITS_LIMIT = {
     "gravity": "a wider swing: raise {limit}, or reduce the lower edge of experiment.band",
     "viscous": "higher speeds: raise {limit}",
 }
-"""Improvements if a limit kept the torque from being raised. Higher frequencies would then make the motion smaller."""
+"""Advice if a limit kept the torque from being raised. In that case, higher frequencies would make the motion smaller.
+"""
 ODD_HINT = "Its residual at odd harmonics indicates friction or ripple that the model lacks."
 EVEN_HINT = (
     "Its residual at even harmonics indicates an effect that depends on direction, or an offset in torque or angle."
@@ -109,7 +110,7 @@ class Evidence:
     cause: str = ""
     """A likely cause of any residual, known from how the motion was driven, as a sentence."""
     ended_early: bool = False
-    """Whether the held-out motion is missing because the recording ends before it settles."""
+    """Whether the held-out motion is missing because the recording ends before that motion settles."""
 
 
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:
@@ -193,7 +194,7 @@ def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
     seen = [each for each in evidence.candidates if each.evidence > 1.0 and each.explained > NOTICEABLE]
     if seen:
         what = _in_words(seen[0].part)
-        advice = "" if evidence.tried_all else ' [model] friction = "auto" tries that.'
+        advice = "" if evidence.tried_all else ' With [model] friction = "auto", that term is tried.'
         explained = f"would explain {100.0 * seen[0].explained:.0f} % of it"
         return f"{cause}The residual looks most like {what}, which {explained}.{advice}"
     if not evidence.tried_all and estimate.model.friction != "stribeck_load":
@@ -368,9 +369,9 @@ def _weak(estimate: Estimate, validation: Validation, limit: TorqueLimit | None)
         return (f"The least certain parameter is {name}, known to within {percent(part)}.",)
     if np.isfinite(part) and _late_back_emf(estimate, name):
         return (
-            f"The least certain parameter is {name}, known to within {percent(part)}. Most of this is due to the delay "
-            "between the voltage and the motor's back-EMF, which is unknown (0.5 ms). Neither another motion nor a "
-            "longer recording reveals it; only current control, if the servo has it, avoids it.",
+            f"The least certain parameter is {name}, known to within {percent(part)}. Most of this is due to the "
+            "unknown delay between the voltage and the motor's back-EMF (about 0.5 ms). Neither another motion nor a "
+            "longer recording reveals this delay. Current control, if the servo supports it, avoids the problem.",
         )
     improvement = improvement_of(name, limit)
     if not np.isfinite(part):
@@ -413,5 +414,5 @@ def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
     counted = "1 sample is an outlier and was" if one else f"{estimate.outliers} samples are outliers and were"
     return (
         f"{counted} downweighted. Possible causes: a jolt, backlash, or late or damaged readings. The residuals in the "
-        "report show where.",
+        "report show where they occur.",
     )

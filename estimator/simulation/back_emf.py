@@ -7,8 +7,8 @@ a lagging voltage and a brake b without lag, is
     1 / (lag J s^2 + J s + b) = 1 / ((lag' s + 1) ((J - b lag') s + b)),    lag' (J - b lag') = lag J
 
 This is exact for a joint of inertia J, which moves as if its inertia were smaller by b lag'. Therefore `Physics.of`
-subtracts back_emf viscous (lag + delay) from the joint's own inertia: 5 to 10 % of it on an XL430. The estimated lag is
-lag', slightly larger than that of the winding.
+subtracts back_emf viscous (lag + delay) from the joint's own inertia, which is 5 to 10 % of that inertia on an XL430.
+The estimated lag is lag', slightly larger than that of the winding.
 
 If the voltage is delayed by d relative to the back-EMF, because a goal waits for the servo's control loop, the
 estimated inertia is too large by b d, whatever the lag.
@@ -46,7 +46,8 @@ def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Array:
-    """Return derivatives (joints, samples, causes) with respect to the parameters `names`, then all other causes.
+    """Return derivatives (joints, samples, causes) with respect to the parameters `names`, then with respect to all
+    other causes.
 
     derivative: the simulation's derivatives with respect to the constants that `causes_of` returns, then the same other
     causes (the initial state, for example). In the simulation, viscous friction, back-EMF and the joint's inertia are

@@ -102,7 +102,7 @@ class Stabilised:
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
-    """Lump the delay into the lag, and subtract the time `command_to_sample` [s] by which commands act earlier."""
+    """Lump the delay into the lag, less the time `command_to_sample` [s] by which commands act before their samples."""
     return replace(physics, lag=max(physics.lag + physics.delay - command_to_sample, 1e-5), delay=0.0)
 
 

@@ -23,7 +23,7 @@ def motor_torque(
         command_to_sample: time from command k's effect to sample k [s].
         steps: integration steps per sample.
         delay: delay of the torque [s], one value or one per joint.
-        lag: time constant of a subsequent first-order lag [s], likewise.
+        lag: time constant of a subsequent first-order lag [s], one value or one per joint.
     """
     return _torque(command, rate, command_to_sample, steps, delay, lag)[0]
 
@@ -114,7 +114,7 @@ def _average_loop(
 
 
 def _follow(command: Any, j: int, rate: float, lag: float, lagging: Any) -> None:
-    """Compute joint j's periodic lagging torque at each command, and its derivative with respect to lag.
+    """Compute joint j's lagging torque, which is periodic, at each command, and its derivative with respect to lag.
 
     The result is written to `lagging` (2, samples). The torque obeys y[k + 1] = a y[k] + (1 - a) u[k]; the steady state
     follows from the value after one period that starts at zero.

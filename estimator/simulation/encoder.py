@@ -8,7 +8,7 @@ from hil.estimator.models.terms import joint_of, kind_of
 
 
 def measured(physics: Physics, position: Array) -> Array:
-    """Return the encoder readings for joints at `position`, both (joints, samples) [rad]."""
+    """Return the encoder readings for joints at `position`; both arrays are (joints, samples) [rad]."""
     if not physics.encoder.any():
         return position
     joints = position.shape[0]
@@ -17,7 +17,7 @@ def measured(physics: Physics, position: Array) -> Array:
 
 
 def without_errors(physics: Physics, reading: Array) -> Array:
-    """Return the joint angles at which the encoders read `reading`, both (joints, samples) [rad]."""
+    """Return the joint angles at which the encoders read `reading`; both arrays are (joints, samples) [rad]."""
     if not physics.encoder.any():
         return reading
     encoder = physics.encoder[: reading.shape[0]]

@@ -76,7 +76,7 @@ class ManyArms:
 
         The values (arms, 5, joints) are lowest and highest angle [rad], speed [rad/s], assumed torque [N m], and
         assumed torque times speed [W]. The second array (arms,) is the number of periods of the first multisine that
-        the arm took to settle. It is 0 if the arm never settled, which ends its experiment.
+        the arm took to settle. It is 0 if the arm never settled; the experiment with this arm then ends.
         """
         count = len(self.physics)
         values, settled = np.empty((count, 5, 2)), np.zeros(count, dtype=np.int64)

@@ -1,8 +1,8 @@
 """Paths whose amplitudes, phases and centre make the least certain base parameter as certain as possible.
 
-The search is an evolution strategy (a mean that moves towards the better half of random variations, N. Hansen and A.
-Ostermeier, Evolutionary Computation 9 (2001) 159, with a single step size) over the coefficients of the finite Fourier
-series of `hil.estimator.chain.excitation.fourier_path`. Every variation is scaled to the limits of position and speed
+The search varies the coefficients of the finite Fourier series of `hil.estimator.chain.excitation.fourier_path`. It is
+an evolution strategy with a single step size, whose mean moves towards the best of many random variations (N. Hansen
+and A. Ostermeier, Evolutionary Computation 9 (2001) 159). Every variation is scaled to the limits of position and speed
 and then shrunk until `allowed` accepts it.
 
 Friction, too, is treated as unknown. If it were known, slow, creeping motion would seem to identify a light joint,
@@ -36,7 +36,7 @@ FIRST_STEP, FASTER, SLOWER = 0.3, 1.1, 0.9
 SHRINKS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
 SWING_SHARE = 0.9  # swing of a path, as a fraction of the distance from its centre to the nearer limit
 LEAST_SWING_SHARE = 0.15
-_MEAN_SHARE = 0.1  # weight of the mean log error in the criterion; the log of the largest has the remaining weight
+_MEAN_SHARE = 0.1  # weight of the mean log error in the criterion; the largest log error has the remaining weight
 
 
 @dataclass(frozen=True)
@@ -180,8 +180,8 @@ class PathDesigner:
     def widest(self, centre: Array, seed: int) -> Design:
         """Return, out of several random paths about a centre, the one whose least-moving joint moves farthest.
 
-        It is used for validation, which cannot resolve prediction errors below encoder rounding and therefore needs a
-        wide motion. Raises ExcitationError if no path is allowed.
+        Such a path is used for validation, which cannot resolve prediction errors below encoder rounding and therefore
+        needs a wide motion. Raises ExcitationError if no path is allowed.
         """
         random = np.random.default_rng(seed)
         found = [self._finished(centre, self._random_lines(random)) for _ in range(WIDEST_OF)]
@@ -202,7 +202,9 @@ class PathDesigner:
         return float((1.0 - _MEAN_SHARE) * errors.max() + _MEAN_SHARE * errors.mean())
 
     def _errors(self, path: Path, every: int) -> Array:
-        """Return the base parameters' standard errors from one period, relative to the prior's (base parameters,)."""
+        """Return the base parameters' standard errors after one period, relative to those of the prior (base
+        parameters,).
+        """
         some = slice(0, None, every)
         Y = self._base.regressor(path.position[:, some], path.velocity[:, some], path.acceleration[:, some])
         level = np.sqrt(np.mean((Y @ self._prior.value) ** 2, axis=1) + self._friction**2) + 1e-6
@@ -228,8 +230,8 @@ class PathDesigner:
         return Design(centre, lines, path, worst, median)
 
     def _fitted(self, centre: Array, lines: Array, waves: tuple[Array, Array, Array]) -> Path | None:
-        """Return the path scaled to the limits of position and speed, then shrunk until `allowed` accepts it, or else
-        None.
+        """Return the path scaled to the limits of position and speed, then shrunk until `allowed` accepts it; None if
+        it is never accepted.
         """
         room = np.minimum(centre - self._limits.low, self._limits.high - centre)
         span = self._limits.high - self._limits.low

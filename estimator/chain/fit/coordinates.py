@@ -45,7 +45,7 @@ SHAPES = {
 }
 """Priors on the shape of friction and on drives: typical value [in its unit] and standard deviation of its logarithm.
 
-Early in a fit, these parameters are held fixed: if other errors drove a lag to zero, it would hardly recover.
+Early in a fit, these parameters are held fixed: if other errors drove a lag to zero, the lag would hardly recover.
 """
 ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
 """Priors on small angles that gravity may not reveal: standard deviations around zero [rad]."""

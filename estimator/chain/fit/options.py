@@ -15,7 +15,8 @@ class ChainOptions:
     A softer observer extracts more information; one that is too soft no longer follows the motion.
     """
     lost: float = 1.5
-    """A softer observer is rejected if the growth in cost exceeds this multiple of what its softness alone would cause.
+    """A softer observer is rejected if the cost grows by more than this multiple of the growth that its softness alone
+    would cause.
     """
     first_step: float = 5.2e-3
     """Integration step while the observer is stiff [s]; samples within such a step are skipped."""
@@ -24,7 +25,7 @@ class ChainOptions:
     fine_step: float = 1.3e-3
     """Integration step of the last iterations [s]."""
     finer: int = 16
-    """Number of smaller steps into which a step near standstill is divided, since friction changes fast there."""
+    """Number of smaller steps into which a step near standstill is divided, since friction changes rapidly there."""
     finest: int = 64
     """Number of smaller steps into which a step near standstill is divided in the last iterations."""
     widths_per_substep: float = CoordinateOptions.widths_per_substep
@@ -35,8 +36,8 @@ class ChainOptions:
     other_initial_widths: tuple[float, ...] = (0.005, 0.001)
     """Initial widths for further fits, tried in turn until one explains the motion [rad/s]."""
     far: float = 3.0
-    """RMS residual of the worst joint, relative to its noise, above which a fit is repeated, first with free encoder
-    zeros.
+    """RMS residual of the worst joint, relative to its noise, above which the fit is repeated: first with free encoder
+    zeros, then, from there, without them.
     """
     poor: float = 1.2
     """RMS weighted residual above which a second initial guess is tried; 1 for noise alone."""

@@ -1,4 +1,4 @@
-"""Distance to the minimum from the point where a fit ended."""
+"""Distance from the point where a fit ended to the minimum."""
 
 import numpy as np
 

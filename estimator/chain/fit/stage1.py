@@ -16,7 +16,7 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.fourier import Lines, PeriodicMotion, cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 
-COULOMB_WIDTH = 0.05  # rad/s: roughly the velocity error of a sticking joint that results from omitting Fourier lines
+COULOMB_WIDTH = 0.05  # rad/s: roughly the velocity error that omitting Fourier lines causes while a joint sticks
 PASSES = 3
 
 
@@ -33,7 +33,7 @@ class ChainLinear:
     motions: tuple[PeriodicMotion, ...]
     """Motion of each period, computed from its Fourier coefficients."""
     relative_residual: Array
-    """RMS of the torque residual relative to that of the torque (joints,)."""
+    """RMS torque residual of each joint, relative to the RMS of its torque (joints,)."""
 
 
 def fit_lines(

@@ -121,8 +121,9 @@ def _softened_later(coarse: ChainProblem, x: Array, options: ChainOptions) -> tu
 
 
 def resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
-    """Return the problem refined to fit the shape of friction and resolve motion near standstill, the minimum found
-    from `soft`, and the number of simulations used.
+    """Refine the problem so that it fits the shape of friction and resolves motion near standstill.
+
+    Returns the refined problem, the minimum found from `soft`, and the number of simulations used.
     """
     narrowest = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
     # An early fit may be far off: if it makes a joint much too light, that joint's friction step must not stay wide.

@@ -6,9 +6,9 @@ absorbs the fraction h(f) of the noise, the leverage of its Jacobian, so the pow
 times 1 - h. The noise level of a joint is the mean over frequencies weighted by leverage; for model errors, which are
 slow, it is far above that of white noise. Since short recordings have few degrees of freedom, each level is shrunk
 towards the mean level of all joints, and this mean towards the level of white noise. The same level is assumed at
-frequencies where the fit absorbs nearly all noise, so that the residual does not reveal it. There, the power of
-rounding errors is no larger than at higher frequencies, since the observer suppresses their slow part. The covariance
-is the sandwich N^-1 S N^-1, where S sums the information of each frequency times the noise there.
+frequencies where the fit absorbs nearly all noise and the residual therefore reveals nothing about its level. There,
+the power of rounding errors is no larger than at higher frequencies, since the observer suppresses their slow part. The
+covariance is the sandwich N^-1 S N^-1, where S sums the information of each frequency times the noise there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,7 @@ from hil.estimator.chain.model.late_torque import lost_inertia, rotor
 from hil.estimator.simulation.back_emf import neglected_inertia
 
 MOST_SAMPLES = 1 << 13  # number of a period's samples to use; enough to estimate a noise level to within 10 %
-SUPPOSED = 10.0  # degrees of freedom of the white level in the common level, and of the common level in each joint's
+SUPPOSED = 10.0  # degrees of freedom assumed for a noise level towards which others are shrunk
 
 
 def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array:
@@ -40,7 +40,7 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
         information = part.information()
         seen += information
         middle += levels[part.joint] * information
-    # The part of the normal matrix that is not due to the data is due to the prior.
+    # The rest of the normal matrix is the contribution of the prior.
     covariance: Array = inverse @ (normal / lengths - seen + middle) @ inverse / lengths
     return covariance
 

@@ -26,8 +26,8 @@ KINDS = (slice(1, 4), slice(4, 10), slice(10, 11), slice(0, 1))  # moments, iner
 CLEARLY_INDEPENDENT = 0.1
 """A column is kept immediately if its unexplained part has a norm above this value.
 
-This is the part that the columns kept so far do not explain. Its norm is relative to the largest column of the same
-link and kind.
+The unexplained part is what remains after the columns kept so far have been fitted to the column. Its norm is relative
+to the largest column of the same link and kind.
 """
 INDEPENDENT = 2e-3
 """A remaining column is kept if its unexplained part (see CLEARLY_INDEPENDENT) has a norm above this value.
@@ -43,7 +43,8 @@ NOTHING = 1e-9
 class BaseParameters:
     """The base parameters of a chain.
 
-    Each is a combination of parameters, named after the one to which it reduces if the others are zero.
+    Each base parameter is a combination of parameters, and is named after the parameter that remains if all others are
+    zero.
     """
 
     chain: Chain
@@ -106,8 +107,8 @@ class BaseParameters:
 def _norms_by_kind(norm: Array) -> Array:
     """Return, for each column, the largest norm of the columns of the same link and kind.
 
-    If a kind has hardly any effect in a link, such as the moments of the first link if its axis is vertical except for
-    rounding, the largest norm of all links is used, so that these columns are not scaled up.
+    If a kind has hardly any effect in a link (for example, the moments of the first link if its axis is vertical to
+    within rounding), the largest norm of all links is used, so that these columns are not scaled up.
     """
     largest = norm.reshape(-1, TERMS).copy()
     for kind in KINDS:

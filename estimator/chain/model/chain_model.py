@@ -28,8 +28,9 @@ class ChainModel:
     zeros: estimate zero errors of the encoders of all joints but the first, as far as gravity reveals them.
     torque_scale: estimate torque scales of all joints but the first, whose torque constant is trusted.
     base_tilt: estimate the tilt of the base; `base` must come from `BaseParameters.of(..., tilts=True)`.
-    lags: estimate each joint's lag, if `drive` has one, as a ratio to joint 1's, since servo models differ.
-    by_voltage: joints (from 1) that are driven by voltage; their back-EMF lags as well.
+    lags: estimate each joint's lag, if `drive` has one, as a ratio to that of joint 1, since the joints' servo models
+    may differ.
+    by_voltage: joints (from 1) that are driven by voltage, so that their back-EMF lags like the drive's torque.
     added_mass: some periods were recorded with a known mass added, which reveals the first joint's torque constant too.
     Raises ModelError.
     """

@@ -2,8 +2,8 @@
 
 The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
 product of back-EMF and lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due
-to back-EMF. The lag of a winding cancels at most half of a joint's inertia, namely when the poles of the equivalent
-motor coincide. Far from a fit's minimum, the computed loss may be greater; it is then limited to that half.
+to back-EMF. The lag of a winding cancels at most half of a joint's inertia; it cancels half if the poles of the
+equivalent motor coincide. Far from a fit's minimum, the computed loss may be greater; it is then limited to that half.
 """
 
 from collections.abc import Mapping, Sequence
@@ -120,8 +120,8 @@ def complete(lost: Losses, derivative: Array) -> None:
 
 
 def _generating(joints: int, parameters: Mapping[str, float]) -> list[tuple[int, float, float, float]]:
-    """Return each voltage-driven joint, the fraction of its viscous friction due to back-EMF, that friction, and the
-    joint's delay.
+    """For each voltage-driven joint, return its index, the fraction of its viscous friction that is due to back-EMF,
+    its viscous friction, and its delay.
     """
     late = lags_of(parameters, joints) + max(parameters.get("delay", 0.0), 0.0)
     return [

@@ -123,5 +123,5 @@ def _coordinates(link: Array) -> Array:
 
 
 def _scales() -> Array:
-    """Return each coordinate's typical step: a factor of e for spreads and mass, otherwise 3 mm or 2 cm."""
+    """Return each coordinate's typical step: 1 for logarithms (a factor of e), and 3 mm or 2 cm for the others."""
     return np.array([1.0, 1.0, 1.0, 1.0, 0.003, 0.003, 0.02, 0.003, 0.02, 0.02])

@@ -32,7 +32,7 @@ class Prior:
     None if nothing is known about them."""
 
     def surpassing(self, names: tuple[str, ...], std: Array) -> tuple[str, ...]:
-        """Return the base parameters whose standard errors exceed the prior's.
+        """Return the base parameters whose standard errors exceed those of the prior.
 
         std: standard errors of the base parameters, optionally followed by those of other parameters.
         """

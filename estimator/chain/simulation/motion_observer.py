@@ -60,7 +60,7 @@ class ChainObserver:
     covariance: covariance of `mean`.
     largest: largest planned torque of each joint (joints,) [N m].
     interval: sampling interval [s].
-    frictions: `largest` is raised to at least this multiple of dry friction, where that is known.
+    frictions: `largest` is raised to at least this multiple of the dry friction, as far as that friction is known.
 
     Raises ValueError for arrays of other shapes.
     """
@@ -113,8 +113,8 @@ class ChainObserver:
             torque: torques commanded since the previous sample [N m].
             seconds: time since the previous sample [s].
             is_free: whether the motion of each joint can be assessed; one value for all or one per joint.
-            support: 1 or -1 for each joint that may rest against an end stop that blocks motion in this direction,
-                otherwise 0 (joints,); None if no joint does.
+            support: for each joint that may rest against an end stop, the direction in which the stop blocks motion
+                (1 or -1), otherwise 0 (joints,); None if there is no such joint.
         """
         return _observe(
             *(self._memory, self._rests, self._theta, self._covariance, self._constants, self._chain, self._work),

@@ -107,7 +107,7 @@ class Pull:
 class Motions:
     """Angles, velocities and commanded torques of all arms (arms, samples, joints) [rad, rad/s, N m].
 
-    NaN after an arm's motion has diverged.
+    The values are NaN once an arm's motion has diverged.
     """
 
     position: Array
@@ -145,7 +145,8 @@ def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = No
 
 
 def _pull_of(loop: Loop) -> tuple[Array, Array, Array]:
-    """Return the path (samples, joints), the growth per sample and rad (joints,), and the maximum (joints,).
+    """Return the path (samples, joints), the torque's growth per sample and radian (joints,), and its maximum
+    (joints,).
 
     The path is empty if `loop.pull` is None.
     """
@@ -171,7 +172,7 @@ def weights(arms: ChainArms, pose: Array) -> Array:
 
 
 def mass_matrices(chain: Chain, link: Array, armature: Array, poses: Array) -> Array:
-    """Mass matrices of one arm in `poses` (poses, joints), (poses, joints, joints) [kg m^2].
+    """Return the mass matrices (poses, joints, joints) [kg m^2] of one arm in `poses` (poses, joints).
 
     link: inertial parameters (joints, 10). armature: (joints,).
     """

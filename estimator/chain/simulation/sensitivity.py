@@ -14,7 +14,7 @@ from hil.estimator.chain.model.tilt import TILT, tilt_slopes, tilted
 from hil.estimator.chain.simulation.stepping import JOINT_TERMS, run
 
 ABSENT = {"coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}
-"""Values that disable terms absent from the model; terms not listed here are disabled by 0."""
+"""Values that disable terms absent from the model; terms not listed here are disabled by the value 0."""
 AT_ONCE = 8
 LINE = 8  # numbers in a cache line
 
@@ -108,8 +108,8 @@ class Simulation:
     def go_on(self, run_: ChainRun, piece: slice) -> tuple[Array | None, Array]:
         """Simulate the next `piece` of the samples.
 
-        Returns the angles (samples, joints) [rad], None if the motion diverges, and their derivatives with respect to
-        `names` and the initial state (samples, joints, names and initial state).
+        Returns the angles (samples, joints) [rad], or None instead if the motion diverges, and their derivatives with
+        respect to `names` and the initial state (samples, joints, names and initial state).
         """
         torque, measured = run_.torque[piece], run_.measured[piece]
         position = np.empty(measured.shape)

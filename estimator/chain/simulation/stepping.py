@@ -226,7 +226,7 @@ def _follow(
 
 
 def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:
-    """Return the number of smaller steps, at most `most`, into which to divide this one.
+    """Return the number of smaller steps, at most `most`, into which to divide this step.
 
     A joint that may pass through the steep part of its friction crosses at most CROSSED widths per smaller step. A
     joint that sticks needs no smaller steps. k: last accelerations.
