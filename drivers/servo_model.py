@@ -50,8 +50,8 @@ supply voltage: supplies sag, and resistance and no-load speed differ by tens of
 """
 
 LEAST_OF_MEASURED = 0.75
-"""Replaces `LEAST_SUPPLY` if the supply voltage was measured. It is less than 1 because motors differ and the supply may
-sag between two readings.
+"""Replaces `LEAST_SUPPLY` if the supply was measured. It is less than 1 because motors differ and the supply may sag
+between two readings.
 """
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85

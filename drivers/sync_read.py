@@ -49,10 +49,10 @@ class Span:
 
     @classmethod
     def each(cls, tables: Sequence[ControlTable], registers: Sequence[Sequence[str]]) -> "tuple[Span, ...]":
-        """Return one span per table, with `registers[i]` of `tables[i]`, all covering the same range of addresses.
+        """Return one span per table: span i decodes `registers[i]` of `tables[i]`, and all cover the same addresses.
 
-        A servo refuses a read that ends at an undefined address. Raises KeyError if a table lacks one of its registers,
-        ValueError if there is no such range.
+        The common range ends at an address that every table defines, since servos refuse other reads. Raises KeyError
+        if a table lacks one of its registers, and ValueError if there is no common range.
         """
         own = [cls._in(table, names) for table, names in zip(tables, registers, strict=True)]
         start = min(span.address for span in own)

@@ -1,5 +1,4 @@
-"""Detection of values that this program cannot have written, but that are read from a servo too often to be accidental.
-"""
+"""Detection of values that this program cannot have written but reads from a servo too often for an accident."""
 
 from collections import deque
 

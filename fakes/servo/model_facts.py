@@ -69,7 +69,7 @@ class ModelFacts:
     """Whether Present Current is the supply current instead of the motor current (330 series)."""
     indirect: Blocks = ((168, 224, 28), (578, 634, 28))
     indirect_of_firmware: tuple[int, Blocks] | None = None
-    """The only firmware version with different blocks, and these blocks."""
+    """The only firmware version that has other blocks than `indirect`, and its blocks."""
 
 
 _Facts = RegisterFacts
@@ -166,9 +166,10 @@ _FIRMWARE_52 = (52, ((168, 208, 20),))
 """Indirect data of the 330 series. Sources contradict each other for firmware before 52.
 
 dynamixel-sdk 4.1 and ROBOTIS' dynamixel_hardware_interface (pull request 69) have two control tables: one with the data
-at 224, and one named fw52, with the data at 208. The e-Manual (2026-09): "Firmware versions prior to V53 support up to
-20 Indirect Address/Data items [...] for Indirect Data is 208 ~ 227"; from then on, 28 at 224. All agree on 208 for
-firmware 52. Before 52, the fake uses 224 like ROBOTIS' own programs, which would otherwise read zeros.
+at 224, and one named fw52, with the data at 208. The e-Manual (2026-09) says: "Firmware versions prior to V53 support
+up to 20 Indirect Address/Data items [...] for Indirect Data is 208 ~ 227"; later versions have 28 items at 224. All
+sources agree on 208 for firmware 52. For earlier firmware, the fake uses 224 like ROBOTIS' own programs, which would
+otherwise read zeros.
 """
 
 
@@ -283,8 +284,8 @@ X_INITIAL: Mapping[str, Mapping[str, int]] = {
     "XH540-V270": _X_INITIAL,
     "XW540-H260": _X_INITIAL,
 }
-"""Factory values in the EEPROM of X models whose ranges are unknown here; for the 24 V models, only values that all of
-them share.
+"""Factory values in the EEPROM of X models whose ranges are unknown here. For the 24 V models, only values that they all
+share are given.
 """
 
 _STRENGTH = (0, 1023)
