@@ -221,7 +221,7 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
 
 
 def _owed(reasons: list[Reason], unreached: list[Reason], cut_ms: float, lower_ms: float) -> tuple[Reason, float]:
-    """The reason whose time limit expires first, and this limit [ms]."""
+    """The reason for ending the current whose time limit expires first, and this time limit [ms]."""
     ends = [(each, cut_ms if each in unreached else lower_ms) for each in reasons]
     return min(ends, key=lambda pair: pair[0][1] + 1e-3 * pair[1], default=(("", np.inf), cut_ms))
 
@@ -245,8 +245,8 @@ def longest_lowering(path: Path) -> float:
 def _leaves_command(drawn: Drawn, ended: float) -> bool:
     """Whether the arm could still be commanded: all faults are of kinds that permit this, and no force held it.
 
-    Only a force that still acts at the end of the run counts. False after a second request to stop, which asks for
-    torque to be cut at once.
+    Only a force that still acts at the end of the run counts. The result is False after a second request to stop, since
+    that asks for torque to be cut at once.
     """
     forced = any(
         each.kind in _BY_FORCE and each.start < ended < each.end and abs(each.amount) > WEAKER for each in drawn.attacks
@@ -274,7 +274,7 @@ def _undisturbed_clearance(setting: Setting) -> float:
 
 
 def _without_held(config: Config, position: Array, time: Array, drawn: Drawn | None) -> Array:
-    """The poses (joints, times) [rad], but with joints at their rest angles while something holds them by force."""
+    """The poses (joints, times) [rad], with joints set to their rest angles while something holds them by force."""
     free = position.copy()
     for attack in drawn.attacks if drawn else ():
         if attack.kind in _BY_FORCE and abs(attack.amount) > WEAKER:

@@ -284,8 +284,8 @@ X_INITIAL: Mapping[str, Mapping[str, int]] = {
     "XH540-V270": _X_INITIAL,
     "XW540-H260": _X_INITIAL,
 }
-"""Factory values in the EEPROM of X models whose ranges are unknown here. For the 24 V models, only values that they all
-share are given.
+"""Factory values in the EEPROM of X models whose ranges are unknown here. For the 24 V models, only values that all of
+them share are given.
 """
 
 _STRENGTH = (0, 1023)
