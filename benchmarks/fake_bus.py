@@ -88,7 +88,7 @@ def _shares(config_path: Path) -> dict[str, float]:
 
 
 def _timed(cls: type, name: str, spent: dict[str, float], key: str) -> Callable[[], None]:
-    """Add the time that a method takes to `spent[key]`; return a function that undoes this."""
+    """Replace a method by one that adds its duration to `spent[key]`; return a function that restores the original."""
     original = getattr(cls, name)
 
     def timed(self: Any, *args: Any) -> Any:

@@ -195,7 +195,7 @@ class ServoBus(TorqueSwitch):
     ) -> LetDown:
         """Ensure that every servo's torque is off before anything is written.
 
-        If it is not, raises TorqueHeld, or lets the arm sink if `BusConfig.take_over` is set (`let_sink`).
+        If torque is on, raises TorqueHeld or, if `BusConfig.take_over` is set, lets the arm sink (`let_sink`).
         ours: joints whose torque was left on by a program that this user ran earlier; that torque is cut immediately.
         before_lowering: called with the joints that are about to be let down, before anything is written to their
         servos; returns the `originals` of `let_sink`.

@@ -1,4 +1,4 @@
-"""Random calls of dynamixel_sdk on a fake arm; every answer is compared with the rules of the manual.
+"""Random calls to a fake arm with dynamixel_sdk; every answer is compared with the rules of the manual.
 
     python -m benchmarks.bus.random_calls --calls 3000 --seed 1
 

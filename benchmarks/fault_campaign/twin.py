@@ -252,7 +252,7 @@ def _altered(arm: Arm, parameters: Array) -> Arm:
             "coulomb": coulomb * drive.coulomb,
             "torque_constant": torque * drive.torque_constant,
         }
-        drives.append(drive.model_copy(update=changed))  # not validated, like links: files bound what a search may try
+        drives.append(drive.model_copy(update=changed))  # not validated: a search may exceed the bounds for files
     start = (arm.start[0] + float(parameters[-1]), *arm.start[1:])
     return arm.model_copy(update={"links": tuple(links), "drives": tuple(drives), "start": start})
 

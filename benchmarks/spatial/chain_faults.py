@@ -103,11 +103,12 @@ LOOKED_AT_MS = 5
 class ChainOutcome:
     """The outcome of one injection.
 
-    owed: why the run had to end, "" if there was no reason. can_command: see above. lies: whether the arm was in its
-    rest pose when current ended. late_ms: how long current flowed after the failure. clearance: least distance while
-    motors drove the arm, minus that of the undisturbed run if the latter is negative [m]. beyond: largest overshoot of
-    a position limit while motors drove the arm [rad]. overruled_ms: longest time for which a motor carried a current
-    that was not commanded; at most `cut_ms` is allowed.
+    owed: why the run had to end; "" if there was no reason. can_command: whether the arm could still be commanded, as
+    described at the top of this file. lies: whether the arm was in its rest pose when current ended. late_ms: how long
+    current flowed after the failure. clearance: least distance while motors drove the arm [m], plus `SAME_M`; if links
+    overlapped in the undisturbed run, that overlap is allowed and added. beyond: largest overshoot of a position limit
+    while motors drove the arm [rad]. overruled_ms: longest time for which a motor carried a current that was not
+    commanded; at most `cut_ms` is allowed.
     """
 
     setting: Setting

@@ -88,7 +88,7 @@ class Overruled(NamedTuple):
 
 
 def pause_after(delay: float, share: float = _DELAYED_SHARE) -> float:
-    """Longest time until the next overdue read-back after one that delayed a cycle by `delay` [s]."""
+    """Longest time [s] from an overdue read-back that delayed a cycle by `delay` [s] until the next one."""
     return min(OVERDUE_S, delay / share) if delay > 0.0 else OVERDUE_S
 
 

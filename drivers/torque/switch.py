@@ -31,7 +31,7 @@ class TorqueSwitch:
     """Switches torque on and off for all servos on one port together.
 
     servos: the servos in bus order, keyed by single-servo joints. After any error, the same object can still cut
-    torque; `torque_off_report` then shows whether it succeeded.
+    torque; `torque_off_report` then shows whether that succeeded.
     """
 
     def __init__(self, port: Port, servos: Mapping[Joint, Servo]) -> None:
@@ -201,7 +201,7 @@ class TorqueSwitch:
             raise interrupts[0]
 
     def zero_own_goals(self, on: Collection[Joint]) -> None:
-        """Zero the goals of servos still in this program's mode; otherwise, they would follow its last goals."""
+        """Zero the goals of servos that are still in this program's mode, so that they do not follow its last goals."""
         for drive in on:
             with suppress(DriverError):
                 servo = self._servos[drive]

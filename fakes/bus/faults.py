@@ -60,7 +60,8 @@ class FaultKind(StrEnum):
 class FaultFacts(NamedTuple):
     """The effect of one kind of fault, and the meaning, default and range (inclusive) of its `amount`.
 
-    amount: what the amount is, with its unit; "" if the kind has none. whole: whether it must be a whole number.
+    amount: meaning of the amount, with its unit; "" if this kind has no amount. whole: whether the amount must be a
+    whole number.
     """
 
     does: str
@@ -188,7 +189,8 @@ class Fault(Described):
 
 
 def _wrong_amount(kind: FaultKind, amount: float | None) -> str:
-    """Return what is allowed, in words, if a fault of this kind cannot have this amount; otherwise ""."""
+    """If a fault of this kind cannot have this amount, return a description of what is allowed; otherwise, "".
+    """
     facts = FAULTS[kind]
     if amount is None or (facts.amount and facts.allows(amount)):
         return ""

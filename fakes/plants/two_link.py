@@ -231,7 +231,7 @@ def _about_joint(link: Link) -> float:
 
 
 def _until_zero(old: float, new: float) -> float:
-    """Return the fraction of the step after which the velocity is zero; 1 if it does not cross zero or starts there."""
+    """Return the fraction of the step after which the velocity crosses zero; 1 if it does not, or starts at zero."""
     return old / (old - new) if old * new < 0.0 else 1.0
 
 

@@ -4,8 +4,8 @@ Source: ROBOTIS e-Manual, pages x/<model> and, for the motors, _data/dxl_x_info.
 of the e-Manual's repository ROBOTIS-GIT/emanual (revisions of 2018 to 2024). Differences from some revisions: the range
 of Min Voltage Limit, given there as 110 to 300 with a factory value of 95, is 95 to 160 here, as on the sister models.
 Protocol Type only accepts 2, because a fake servo does not support any other. Drive Mode accepts bit 3 (Torque On by
-Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the others. Velocity Limit of
-the XH430-W210 is that of the XD430-T210, although the oldest page of the XH430-W210 itself states 360.
+Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the other pages. Velocity Limit
+of the XH430-W210 is that of the XD430-T210, although the oldest page of the XH430-W210 itself states 360.
 
 Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
 tens of percent, which is enough for position moves to look realistic.
