@@ -45,7 +45,7 @@ RECORD = np.dtype(
 
 
 class Witness:
-    """Wraps the plant and records every step. It affects the plant only by the disturbances requested with `disturb`."""
+    """Wraps the plant and records every step. Its only effects on the plant are those requested with `disturb`."""
 
     def __init__(self, bus: FakeBus) -> None:
         self._plant = bus.plant

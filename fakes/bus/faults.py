@@ -189,8 +189,7 @@ class Fault(Described):
 
 
 def _wrong_amount(kind: FaultKind, amount: float | None) -> str:
-    """If a fault of this kind cannot have this amount, return a description of what is allowed; otherwise, "".
-    """
+    """Return a description of the allowed amounts if a fault of this kind cannot have this amount, otherwise ""."""
     facts = FAULTS[kind]
     if amount is None or (facts.amount and facts.allows(amount)):
         return ""

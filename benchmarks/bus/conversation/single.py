@@ -136,7 +136,7 @@ class SingleInstructions(Host):
                 self.differ(f"goal_position {goal}", read)
 
     def watchdog(self) -> None:
-        """Check that Bus Watchdog trips only if torque is on and packets cease, and blocks goals until it is cleared."""
+        """Check that Bus Watchdog trips if packets cease, but only with torque on, and blocks goals until cleared."""
         servo = self.any_servo()
         if servo.level < 2 or servo.alert:
             return
