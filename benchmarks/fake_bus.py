@@ -88,7 +88,7 @@ def _shares(config_path: Path) -> dict[str, float]:
 
 
 def _timed(cls: type, name: str, spent: dict[str, float], key: str) -> Callable[[], None]:
-    """Replace a method by one that adds its duration to `spent[key]`; return a function that restores the original."""
+    """Wrap a method so that its duration is added to `spent[key]`; return a function that restores the original."""
     original = getattr(cls, name)
 
     def timed(self: Any, *args: Any) -> Any:

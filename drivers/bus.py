@@ -44,8 +44,8 @@ class BusConfig:
     slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
     voltage plus temperature.
     watchdog_required: whether to reject firmware without Bus Watchdog.
-    take_over: if torque is already on, whether to let the arm sink slowly and then cut torque; otherwise, the program
-    refuses to start.
+    take_over: whether to let an arm whose torque is already on sink slowly, and then cut torque, instead of refusing to
+    start.
     interval: time between two samples [s]; 0 if the rate is not fixed, in which case the servos' status is not read.
     """
 

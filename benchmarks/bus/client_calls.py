@@ -122,7 +122,7 @@ def dynamixel_easy_sdk(device: str) -> Iterator[Call]:
 
 
 def rustypot(device: str) -> Iterator[Call]:
-    """Calls made with rustypot to fake_two_link, through its XL430 controller, whose register addresses are equal."""
+    """Calls made with rustypot to fake_two_link, through its XL430 controller, which uses the same addresses."""
     import rustypot as library
 
     client = library.Xl430PyController(device, BAUD, 0.5)

@@ -1,4 +1,4 @@
-"""Bundled configurations adapted for a campaign: other rates, short periods, and a fake arm where it is missing."""
+"""Bundled configurations adapted for a campaign: other rates, short periods, and a fake arm if they have none."""
 
 import json
 import tomllib

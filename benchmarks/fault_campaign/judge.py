@@ -231,7 +231,7 @@ def addressed(config: Config, record: NDArray[Any], joint: int) -> NDArray[Any]:
 
 
 def acts_at(attack: Attack, attacks: Sequence[Attack]) -> float:
-    """Time at which an attack takes effect [s]: its start or, if the program is suspended then, when it resumes."""
+    """Time at which an attack takes effect [s]: its start or, if the program is suspended then, when that ends."""
     stops = [each for each in attacks if each.kind in (Kind.STALL, Kind.SUSPENDED) and each.start <= attack.start]
     return max([attack.start, *(each.start + each.amount for each in stops)])
 

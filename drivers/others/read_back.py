@@ -152,7 +152,7 @@ class ReadBack:
         self._missed: list[deque[int]] = [deque(maxlen=LOST_GOALS) for _ in ids]
         """Indices of the latest read-backs that found an older goal of this program, by servo."""
         self.watchdogs: list[tuple[int, int]] = []
-        """Index and Bus Watchdog of each servo that answered the latest read-back; empty if this did not read goals."""
+        """Index and Bus Watchdog of each servo that answered the latest read-back; empty unless goals were read."""
         self.torque_off: int | None = None
         """Index of a servo whose Torque Enable read 0 when it was last read back; None if there is none."""
         self.overdue_at = math.inf

@@ -1,4 +1,4 @@
-"""Chooses how many exchanges to make per sample and per status read, as far as their time on the wire permits."""
+"""Chooses the number of exchanges per sample and per status read; both are limited by the time on the wire."""
 
 import math
 from collections.abc import Sequence

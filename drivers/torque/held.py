@@ -95,8 +95,8 @@ def _current(joint: Joint, servo: Servo) -> str:
 
 
 def let_sink(held: Mapping[Joint, Servo], clock: Clock, originals: Originals | None = None) -> LetDown:
-    """Ramp the output of held servos down to zero, wait until the joints no longer sink, cut torque, and then restore
-    the goals that were lowered to their former values.
+    """Ramp the output of held servos down to zero, wait until the joints no longer sink, cut torque, and then reset the
+    lowered goals to the values that they had before.
 
     originals: settings to name in messages, since an earlier program may already have lowered the present goals.
 

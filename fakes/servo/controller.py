@@ -38,7 +38,7 @@ _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 
 
 def obeyed_current(memory: Memory) -> int:
-    """Return the Goal Current that is applied [ticks], which respects a Current Limit lowered after it was written."""
+    """Return the Goal Current that is applied [ticks]. Current Limit applies even if it was lowered afterwards."""
     goal, limit = memory.get("Goal Current"), memory.get("Current Limit")
     return max(-limit, min(limit, goal))
 

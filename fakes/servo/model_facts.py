@@ -69,7 +69,7 @@ class ModelFacts:
     """Whether Present Current is the supply current instead of the motor current (330 series)."""
     indirect: Blocks = ((168, 224, 28), (578, 634, 28))
     indirect_of_firmware: tuple[int, Blocks] | None = None
-    """The only firmware version that has other blocks than `indirect`, and its blocks."""
+    """The only firmware version with blocks other than `indirect`, and its blocks."""
 
 
 _Facts = RegisterFacts
