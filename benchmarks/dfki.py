@@ -4,9 +4,9 @@
 
 DIR holds c1_sinusoids_*.csv and c1_swing_up_*.csv. Multiple shooting and filtered inverse-dynamics least squares
 (IDIM-LS) are fitted to the sinusoids; `length` = 9.81 coupling / gravity_2 should be 0.2 m. The swing-ups are held out:
-both predict them for half a second at a time from the same measured states. IDIM-LS uses the torque delay with the
-smallest residual. No rule gives its cut-off frequency in advance, so three are compared: `customary` is five times the
-highest tone (8 Hz); `chosen` predicts the sinusoids best; `best` predicts the swing-ups best, although nobody could
+both methods predict them for half a second at a time, from the same measured states. IDIM-LS uses the torque delay with
+the smallest residual. No rule gives its cut-off frequency in advance, so three are compared: `customary` is five times
+the highest tone (8 Hz); `chosen` predicts the sinusoids best; `best` predicts the swing-ups best, although nobody could
 know this in advance.
 
 The encoders are zeroed at every start, although dry friction may hold the arm away from its rest pose, by up to 0.07

@@ -261,10 +261,10 @@ class ServoBus(TorqueSwitch):
     ) -> ReadBackExchange:
         """Return an exchange with these servos, after reading their Return Delay Times.
 
-        fast: use Fast Sync Read instead of Sync Read.
-        one_write: send the goals and the read request in one write instead of two.
-        slow_every: cycles between two slow reads; by default `BusConfig.slow_every`.
-        status: read the servos' status periodically, if there is time.
+        fast: whether to use Fast Sync Read instead of Sync Read.
+        one_write: whether to send the goals and the read request in one write instead of two.
+        slow_every: number of cycles between two slow reads; by default `BusConfig.slow_every`.
+        status: whether to read the servos' status periodically if there is time.
         patience: minimum time to wait for replies before they count as lost [s].
         """
         servos = self._servos.values()

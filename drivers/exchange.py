@@ -74,8 +74,8 @@ class Exchange:
     goal: the goal register, or one per servo.
     spans, status: registers to read; each is one span for all servos, or one per servo.
     return_delay: the longest Return Delay Time of the servos [s].
-    fast: read with Fast Sync Read.
-    one_write: send both packets in one write instead of two.
+    fast: whether to read with Fast Sync Read.
+    one_write: whether to send both packets in one write instead of two.
     slow_every: number of cycles between two reads of a slow span, i.e. one of `spans[1:]`.
     status_every: number of cycles between two status reads; there are none if `status` is None.
     interval: time between two cycles [s], 0 if unknown; the longer it is, the longer a cycle can wait for a reply.

@@ -1,7 +1,7 @@
 """One servo on a port, for set-up work: pings, and register reads and writes by name, with up to three attempts each.
 
 Everything goes through the packet handler of `dynamixel-sdk`. Writes are read back, because a status packet only
-confirms that the instruction was understood, not what the register now holds.
+confirms that the instruction was understood, and does not show what the register now holds.
 """
 
 from collections.abc import Callable

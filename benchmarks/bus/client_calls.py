@@ -1,7 +1,7 @@
 """Call one client's functions on a fake arm; print the results as one line of JSON. Arguments: CLIENT DEVICE.
 
-This script runs in any environment that has the client and does not import hil; `benchmarks/bus/clients.py` calls
-it. A call is wrong if it raises or if its result differs from that of a real servo.
+This script is run by `benchmarks/bus/clients.py`. It does not import hil, so it runs in any environment that has the
+client. A call is wrong if it raises or if its result differs from that of a real servo.
 """
 
 import builtins

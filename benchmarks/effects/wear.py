@@ -1,4 +1,4 @@
-"""`hil diff` on pairs of runs of one fake arm: changes found, and false alarms.
+"""`hil diff` on pairs of runs of one fake arm: how many changes it finds, and how many false alarms it raises.
 
     python -m benchmarks.effects.wear --runs 6
 

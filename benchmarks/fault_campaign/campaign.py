@@ -152,7 +152,7 @@ def inject_drawn(ready: Ready, drawn: Drawn, seed: int) -> Outcome:
 
 
 def play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str, ...]]:
-    """Run `hil record` once; return its story, whether its recording is readable, and which registers it changed."""
+    """Run `hil record` once; return its Story, whether the recording is readable, and which registers have changed."""
     witnesses: list[Witness] = []
     before: dict[int, dict[str, int]] = {}
 

@@ -123,7 +123,7 @@ class Verdict:
 
 
 def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Verdict:
-    """Judge the run of `story`, into which `drawn` was injected."""
+    """Judge the run that `story` describes, into which the faults `drawn` were injected."""
     told = Told(config, story.traffic, drawn.start)
     reasons = reasons_of(config, drawn, story, undisturbed, told)
     owed, since = min(reasons, key=lambda reason: reason[1], default=("", np.inf))
@@ -231,7 +231,7 @@ def addressed(config: Config, record: NDArray[Any], joint: int) -> NDArray[Any]:
 
 
 def acts_at(attack: Attack, attacks: Sequence[Attack]) -> float:
-    """Time at which an attack takes effect [s]: its start or, if the program is suspended then, when that ends."""
+    """Time at which an attack takes effect [s]: at its start or, if the program is suspended, once it resumes."""
     stops = [each for each in attacks if each.kind in (Kind.STALL, Kind.SUSPENDED) and each.start <= attack.start]
     return max([attack.start, *(each.start + each.amount for each in stops)])
 

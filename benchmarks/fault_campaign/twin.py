@@ -196,7 +196,7 @@ def _stick(arm: Arm) -> Arm:
 
 
 def _differences(arm: Arm, parameters: Array, told: Heard) -> Array:
-    """Differences of angles, then of velocities, divided by ordinary differences (2 n joints,)."""
+    """Differences of all angles, then of all velocities, each divided by its ordinary size (2 n joints,)."""
     angle, velocity = _played(arm, parameters, told)
     return np.concatenate(((angle - told.angle).ravel() / SAME_RAD, (velocity - told.velocity).ravel() / SAME_RAD_S))
 

@@ -292,7 +292,7 @@ class ReadBack:
         self.kind = other if now >= self._due[other] and self._goals_since >= enough else GOALS
 
     def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], *, collided: bool) -> list[Overruled]:
-        """Return the values that servos hold but this program did not write."""
+        """Return the values that servos hold although this program did not write them."""
         if self.kind != GOALS:
             found = self._other_settings(servos) if self.kind == MODES else []
             self.is_unexpected = bool(found)

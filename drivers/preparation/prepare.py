@@ -35,8 +35,8 @@ _SLOWER_THAN_KNOWN_S = 1.5e-3
 def learn_latency(servo: Servo) -> None:
     """Increase the port's reply timeout if this servo's replies are slow, as over Bluetooth or a network.
 
-    The port's `latency` is raised to the measured value plus a margin if that exceeds what this kind of adapter should
-    need; a full-speed USB adapter needs 1 to 2.5 ms.
+    If the measured latency exceeds what this kind of adapter should need, the port's `latency` is raised to the
+    measured value plus a margin. A full-speed USB adapter needs 1 to 2.5 ms.
     """
     port, usual = servo.port, servo.port.latency
     trips = latest = _trips(servo)

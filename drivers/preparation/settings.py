@@ -102,7 +102,7 @@ def read_settings(servo: Servo) -> dict[str, int]:
 
 
 def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
-    """Return the settings with goals clamped to the limits, which another program may have lowered meanwhile.
+    """Return the settings with goals clamped to the limits, since another program may have lowered the limits.
 
     A limit that is itself in `settings` is restored before its goal; otherwise, the servo's present limit applies.
     Raises the errors of `Servo.read`.
@@ -234,7 +234,7 @@ def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | 
 
 
 def arms_itself(servo: Servo) -> bool:
-    """Return whether this servo switches torque on by itself at power-up or reboot. Raises `Servo.read`'s errors."""
+    """Return whether the servo itself switches torque on at power-up or reboot. Raises the errors of `Servo.read`."""
     with suppress(DriverError):
         return bool(servo.read_entry(STARTUP_CONFIGURATION) & TORQUE_ON_AT_STARTUP)
     return False  # older firmware has no such register

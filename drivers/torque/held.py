@@ -132,7 +132,7 @@ class _Lowering:
         self._written: dict[tuple[Joint, str], int] = {}
 
     def run(self) -> tuple[Joint, ...]:
-        """Reduce the output to zero, wait until the joints are still, and return those still moving after SINKING_S."""
+        """Reduce the output to zero, wait until the joints are at rest, and return those in motion after SINKING_S."""
         for servo in self._held.values():
             if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
                 servo.write("Bus Watchdog", 0)  # tripped, it locks the goals

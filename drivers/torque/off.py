@@ -308,7 +308,7 @@ def was_rebooted(servo: Servo) -> bool | None:
 
 
 def _confirm(servo: Servo, interrupts: list[BaseException], *, at_once: bool) -> Exception | None:
-    """Switch torque off and read it back; return None, or the failure.
+    """Switch torque off and read it back; return None if this succeeded, otherwise the exception.
 
     at_once: try only once, and send nothing after a missing reply.
     """
@@ -317,9 +317,9 @@ def _confirm(servo: Servo, interrupts: list[BaseException], *, at_once: bool) ->
 
 
 def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) -> Exception | None:
-    """Run `action`; return None, or the failure.
+    """Run `action`; return None if it succeeded, otherwise the exception.
 
-    An interrupt is appended to `interrupts` and the action is run again.
+    If an interrupt arrives, it is appended to `interrupts`, and the action is run again.
     """
     for _ in range(_INTERRUPTS_BORNE):
         try:

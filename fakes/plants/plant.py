@@ -1,4 +1,4 @@
-"""Plants, i.e. the mechanisms driven by the fake servos: interface and loading.
+"""Interface and loading of plants, i.e. of the mechanisms that the fake servos drive.
 
 A custom plant is any object with the members of `Plant`, created by a function that takes the description's
 `plant_options` as keyword arguments:

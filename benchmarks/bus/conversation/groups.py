@@ -258,7 +258,7 @@ class Conversation(SingleInstructions):
         self.ask("noise", clutter + packet(servo.id, codec.PING), [(servo, {FINE})])
 
     def nonsense(self) -> None:
-        """Send undefined instructions, undefined IDs, and a status packet."""
+        """Send undefined instructions, a ping to an undefined ID, and a status packet."""
         servo = self.any_servo()
         undefined = self.random.choice((0x00, 0x07, 0x0F, 0x21, 0x77, 0x99))
         self.ask(f"undefined {undefined:#x}", packet(servo.id, undefined), self.answers(servo, {INSTRUCTION}))
