@@ -1,4 +1,4 @@
-"""Benchmark of one control cycle against other clients, over a pty with the same C responder at the far end.
+"""Benchmark of one control cycle of hil and of other clients, over a pty with the same C responder at the far end.
 
     python benchmarks/bus_cycle.py            prints tables and ratios
     python benchmarks/bus_cycle.py --json     one JSON object on standard output and nothing else
@@ -46,7 +46,7 @@ PATIENCE_S = 2.0
 """Reply timeout [s], long enough that late replies on a busy machine do not count as lost."""
 
 STILL_A = 0.01
-"""A current that dry friction resists."""
+"""A current too small to overcome dry friction [A]."""
 
 GOAL_CURRENT, PRESENT = (102, 2), (126, 10)
 
@@ -54,7 +54,7 @@ Cycle = Callable[[], object]
 
 
 class Round(NamedTuple):
-    """One client's round: CPU time per cycle [us], median round trip [us], cycles per second."""
+    """One round of one client: CPU time per cycle [us], median round trip [us], cycles per second."""
 
     cpu_us: float
     p50_us: float

@@ -2,11 +2,12 @@
 
     python benchmarks/chain.py [--json] [--seeds N] [--joints 4 6] [--peers]
 
-The arms are configs/open_manipulator_x_like.urdf and configs/viperx_300_like.urdf. The true arms have masses 20 %
-above or below these (at random for each link), centres of mass shifted by up to 1 cm, and randomly drawn drives: static
-friction with a Stribeck rise, and a current-loop lag of 1 ms. Each follows a finite Fourier path of 10 s at 400 Hz by
-feed-forward from the inaccurate model and a software spring and damper; angles are rounded to 4096 steps per turn and
-currents to the servo's ticks. One settled period is recorded; a second path is held out.
+The descriptions of the arms are configs/open_manipulator_x_like.urdf and configs/viperx_300_like.urdf. Each mass of a
+true arm is 20 % above or below the described one (at random), its centres of mass are shifted by up to 1 cm, and its
+drives are drawn at random: static friction with a Stribeck rise, and a current-loop lag of 1 ms. Each arm follows a
+finite Fourier path of 10 s at 400 Hz, controlled by feed-forward from the inaccurate model and by a software spring and
+damper. Angles are rounded to 4096 steps per turn, and currents to the servo's ticks. One settled period is recorded; a
+second path is held out.
 
 Figures for each number of joints, worst over all seeds:
 
@@ -15,14 +16,15 @@ base_median_percent    median error of the base parameters that contribute at le
 residual_ticks         residual of stage 2, worst joint; rounding alone leaves 0.289
 held_out_percent       closed-loop prediction of the held-out motion: RMS error divided by motion RMS, worst joint
 coverage_95            share of base parameters within their 95 % intervals, over all seeds
-seconds                wall time of both stages on one core, without compilation; processor_seconds: processor time
+seconds                wall time of both stages on one core, without compilation
+processor_seconds      processor time of both stages
 iterations             number of simulations that include all sensitivities
 share_of_classic       ratio of the torque error to that of the classic method on the same recording
 classic                the same figures for filtered inverse-dynamics least squares: the best of three cut-offs, chosen
                        by comparison with the truth; it has no one-step-ahead residual
 
 mujoco_sysid           with --peers: torque and base parameter errors of mujoco.sysid on the first seed's recording,
-                       its parameters and processor time on all cores, and the ratio of the latter to ours
+                       its number of parameters, its processor time on all cores, and the ratio of this time to ours
 
 `--json` prints {"arms": {"4": {...}, "6": {...}}} and nothing else.
 """
@@ -112,7 +114,7 @@ BENCHES = {
 
 @dataclass(frozen=True)
 class Setup:
-    """A true arm and the prior knowledge about it."""
+    """A true arm, and what is known about it before the experiment."""
 
     arm: ChainArm
     base: BaseParameters

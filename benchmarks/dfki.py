@@ -1,18 +1,19 @@
-"""A real arm recorded by others, the DFKI double pendulum C.1: length of link 1 and predictions of swing-ups.
+"""Recordings of a real arm made by others, the DFKI double pendulum C.1: length of link 1 and prediction of swing-ups.
 
     python benchmarks/dfki.py DIR [--json] [--torque con|meas] [--floor]
 
 DIR holds c1_sinusoids_*.csv and c1_swing_up_*.csv. Multiple shooting and filtered inverse-dynamics least squares
 (IDIM-LS) are fitted to the sinusoids; `length` = 9.81 coupling / gravity_2 should be 0.2 m. The swing-ups are held out:
-both predict them for half a second at a time from the same measured states. IDIM-LS uses the torque delay with the
-smallest residual. No rule gives its cut-off in advance: `customary` is five times the highest tone (8 Hz),
-`chosen` predicts the sinusoids best, `best` predicts the swing-ups best, which cannot be known in advance.
+both methods predict them for half a second at a time, from the same measured states. IDIM-LS uses the torque delay with
+the smallest residual. No rule gives its cut-off frequency in advance, so three are compared: `customary` is five times
+the highest tone (8 Hz); `chosen` predicts the sinusoids best; `best` predicts the swing-ups best, although nobody could
+know this in advance.
 
 The encoders are zeroed at every start, although dry friction may hold the arm away from its rest pose, by up to 0.07
 rad in these recordings. Within half a second near the upright pose, such an error grows tenfold. Therefore, two
 comparisons are made. `swing_up` assumes that the zeros are 0, as a reader of the file would. For `swing_up_zeroed`, the
-two zeros of each half of a swing-up are fitted to the other half with fixed parameters, and the better of the two
-results counts for IDIM-LS.
+two encoder zeros for each half of a swing-up are fitted to its other half, with fixed parameters; for IDIM-LS, the
+better of `swing_up` and `swing_up_zeroed` counts.
 
 --floor estimates how much of the error is unavoidable, using the predicted data themselves: encoder zeros
 fitted to each swing-up, and parameters fitted to the swing-ups or to all recordings together.
@@ -43,7 +44,7 @@ from hil.recordings.convert import convert
 from hil.recordings.csv_file import read_csv_table
 
 CONFIG = Path(__file__).parents[1] / "configs" / "recordings" / "dfki_double_pendulum.toml"
-SEPARATE = 30.0  # Hz, cut-off of positions if regressors and torques have a separate one
+SEPARATE = 30.0  # Hz, cut-off for positions if it differs from that for regressors and torques
 CUTOFFS = {f"{each:g} Hz": (each, each) for each in (3.0, 4.0, 5.0, 8.0, 15.0, 30.0)} | {
     f"{each:g} Hz, positions {SEPARATE:g} Hz": (each, SEPARATE) for each in (2.0, 3.0, 4.0, 8.0)
 }
@@ -145,7 +146,7 @@ def shooting_fit(recordings: list[Recording]) -> ShootingEstimate:
 
 
 def floor(sines: list[Recording], swings: list[Recording], parameters: dict[str, float]) -> dict[str, Any]:
-    """RMS prediction errors of the swing-ups [rad] if the swing-ups themselves are used to fit zeros or parameters."""
+    """RMS prediction errors of the swing-ups [rad] if zeros or parameters are fitted to the swing-ups themselves."""
     errors, _ = prediction_errors(swings, parameters, HORIZON, 2)
     squares = np.sort(np.sum(errors**2, axis=1))[::-1]
     hindsight = np.concatenate([zeros_of(swing, parameters) for swing in swings])

@@ -6,12 +6,12 @@ With --arms N, N arms are drawn from a prior with 30 % spread; each runs, in vir
 dry run with this prior allows. Then the arm of configs/first_time.toml is identified from joint limits and link lengths
 only, with a pilot and a full run. With --pilots N, N - 1 more arms drawn from the prior are identified in the same way.
 
-within_quantile       share of arms whose measured peaks all stay within the predicted 99 %
-limit_touched         arms that the guard had to stop
-range_used            share of the position range used by the full run's worse joint; smallest of the pilot arms
+within_quantile       share of arms whose measured peaks are all within the predicted 99 % quantiles
+limit_touched         number of arms that the guard had to stop
+range_used            share of the position range used by the full run's worse joint; smallest value of all pilot arms
 std_ratio_pilot_full  worst relative standard error (offsets relative to dry friction) after the pilot, divided by that
-                      after the full run; smallest of the pilot arms
-std_ratio_least       the same ratio for each single parameter; smallest of all
+                      after the full run; smallest value of all pilot arms
+std_ratio_least       the same ratio for each single parameter; smallest value of all parameters and pilot arms
 predicted_over_seen   largest relative deviation of a measured peak from the prediction after the pilot
 worst_std_ratio       worst relative standard error with the designed multisine, divided by that with a plain multisine
                       of the same limits and duration

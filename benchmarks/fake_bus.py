@@ -6,8 +6,8 @@
   time: arm time divided by CPU time, best of five runs. `bus_share_us`, `plant_share_us`: time of bus and plant per
   cycle.
 - `servos_us`: one control cycle of the bus alone, with a trivial plant, for one to six servos.
-- `pty_*`: `hil fake --pty` in a separate process, and a client here that writes goals and reads states 1000 times a
-  second for S seconds at 4 Mbaud (at 1 Mbaud, transferring the bytes of a cycle takes more than a millisecond).
+- `pty_*`: `hil fake --pty` in a separate process, and a client in this process that writes goals and reads states 1000
+  times a second for S seconds at 4 Mbaud (at 1 Mbaud, transferring the bytes of a cycle takes more than a millisecond).
 """
 
 import argparse
@@ -88,7 +88,7 @@ def _shares(config_path: Path) -> dict[str, float]:
 
 
 def _timed(cls: type, name: str, spent: dict[str, float], key: str) -> Callable[[], None]:
-    """Add the time that a method takes to `spent[key]`; return a function that undoes this."""
+    """Wrap a method so that its duration is added to `spent[key]`; return a function that restores the original."""
     original = getattr(cls, name)
 
     def timed(self: Any, *args: Any) -> Any:

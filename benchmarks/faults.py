@@ -9,7 +9,8 @@ servos. It is judged from the emulated servos' own record of every millisecond (
 unsafe          current flowed for more than 100 ms after the first permanent failure (for more than the watchdog's
                 timeout if the program cannot reach the servo), or still flowed after the end of the program
 alike           current flowed for too long, but a healthy arm would have sent the same replies until shortly before
-                its end, so nothing could be detected and the run does not count as unsafe (fault_campaign/twin.py)
+                the current ended. The fault could therefore not be detected earlier, and the run does not count as
+                unsafe (fault_campaign/twin.py)
 beyond_limit    a joint overshot its limit by more than `hil dry-run` predicts
 unreadable      an unexpected exception, no message, or a recording that cannot be read
 unnamed         the message does not name the cause, as judged by lists of words for each cause

@@ -3,10 +3,10 @@
     python benchmarks/fixed_rate.py                  10 s of each loop at 500 Hz and at 1 kHz
     python benchmarks/fixed_rate.py --seconds 60 --json
 
-Lateness is the time from a deadline to the moment at which its work can begin. Drift is the difference in lateness
-between the last and the first deadlines of a run. The top level of the JSON object holds the worst
-values of hil's loop over both rates. This loop is also stalled deliberately for ten and a half periods; it must then
-count nine missed deadlines.
+Lateness is the time from a deadline to the moment at which its work can begin. Drift is the lateness of the last
+deadlines of a run minus that of the first ones. The top level of the JSON object holds the worst values of hil's loop
+over both rates. In addition, this loop is stalled deliberately for ten and a half periods; it must then count nine
+missed deadlines.
 """
 
 import argparse
@@ -43,7 +43,7 @@ def sleep_dt(rate: float, count: int) -> tuple[Lateness, int]:
         began = time.perf_counter()
         late[index] = began - (start + index * interval)
         time.sleep(max(0.0, interval - (time.perf_counter() - began)))
-    # In a drifting loop, a period counts as missed if its lateness grew by at least one interval.
+    # In a drifting loop, a deadline counts as missed if the lateness grew by at least one interval since the last one.
     return late, int((np.diff(late) >= interval).sum())
 
 

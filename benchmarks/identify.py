@@ -2,9 +2,8 @@
 
     python benchmarks/identify.py [--json] [--seeds N]
 
-Each arm is identified with N seeds (different phases of the multisine). The output
-gives the worst seed, and the number of further seeds that the guard stopped because their phases swing the arm beyond
-a limit. `demo_seconds` is the time of
+Each arm is identified with N seeds (different phases of the multisine). The output gives the worst seed, and the number
+of further seeds that the guard stopped because their phases swing the arm beyond a limit. `demo_seconds` is the time of
 `hil identify configs/fake_two_link.toml` in a new process with an empty numba cache.
 """
 

@@ -39,7 +39,7 @@ EXCHANGE_S = 0.39e-3
 
 
 class StandIn:
-    """A substitute for the bus, whose joints are deflected in proportion to their current."""
+    """A substitute for the bus. Its joints are deflected in proportion to their current."""
 
     def __init__(self, config: Config, clock: VirtualClock, swing: float) -> None:
         self.joints = config.bus.joints
@@ -58,7 +58,7 @@ class StandIn:
     def exchange(self, goals: list[float]) -> State:
         self.spent.append(time.thread_time_ns() - self._left_at)
         now = self.clock.now()
-        # Half an interval late: then, over whole waves, the motors do no work, and the guard has nothing to stop.
+        # The motion lags by half an interval. Over whole waves, the motors then do no work, so the guard does not stop.
         position = tuple(
             rest + 0.5 * self._swing * (goal + former)
             for rest, goal, former in zip(self._rest, goals, self._former, strict=True)
@@ -99,7 +99,7 @@ def measure(rate: float, period: float) -> dict[str, Any]:
     bus = StandIn(config, clock, 0.05)
     with tempfile.TemporaryDirectory() as folder, Recorder(Path(folder) / "samples.npy", 2, plan.capacity) as recorder:
         stream = Stream(bus, plan, config, recorder, StopRequest(), lambda _: None, lambda _: None)  # type: ignore[arg-type]
-        # The substitute does not obey mechanics: the model checks every sample, but its verdict is ignored.
+        # The substitute does not obey the laws of mechanics. The model checks every sample, but its verdict is ignored.
         assert stream._model is not None
         stream._model._raise = lambda *_: None  # type: ignore[method-assign]
         gc.collect()

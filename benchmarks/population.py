@@ -59,7 +59,7 @@ NOTHING = 1e-9  # N m
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome for one arm. errors: relative error and error in standard errors of each judged parameter."""
+    """The outcome for one arm. errors: each judged parameter's relative error, and its error in standard errors."""
 
     seed: int
     name: str
@@ -80,7 +80,7 @@ class Outcome:
 
     @property
     def wrong(self) -> dict[str, tuple[float, float]]:
-        """Parameters whose errors exceed both bounds."""
+        """Parameters whose errors exceed both the relative bound and the bound in standard errors."""
         return {n: e for n, e in self.errors.items() if abs(e[0]) > TOLERANCE and not abs(e[1]) <= DEVIATIONS}
 
     def __str__(self) -> str:
@@ -151,7 +151,7 @@ def _identify(path: Path, folder: Path) -> tuple[dict[str, Any] | None, str, flo
 
 
 def _motion(config: Config, folder: Path) -> tuple[float, int, float, float]:
-    """Time driven [s], number of runs, largest overshoot beyond a limit and its prediction [rad]."""
+    """Time for which the arm was driven [s], number of runs, largest overshoot of a limit, and its prediction [rad]."""
     seconds, steps, beyond, predicted = 0.0, 0, 0.0, 0.0
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     for path in sorted(folder.rglob("samples.npy")):
@@ -201,7 +201,7 @@ def _judged(outcome: Outcome, arm: DrawnArm, config: Config, result: dict[str, A
         if not name.startswith(JUDGED):
             continue
         true = truth[name] * arm.units
-        # In a horizontal arm the true gravity is zero: its error is related to friction instead.
+        # The true gravity terms of a horizontal arm are zero, so their errors are divided by friction instead.
         size = abs(true) if abs(true) > NOTHING else arm.units * friction
         error = entry["value"] - true
         std = entry["std"]
@@ -222,7 +222,7 @@ def _judged(outcome: Outcome, arm: DrawnArm, config: Config, result: dict[str, A
 
 
 def figures(outcomes: list[Outcome]) -> dict[str, Any]:
-    """The printed figures."""
+    """Return the figures to print."""
     yes = [each for each in outcomes if each.trust == "yes"]
 
     def share(of: list[Outcome]) -> float | None:

@@ -13,7 +13,7 @@ lost_after_kill   rows missing or duplicated after a worker is killed five times
 bytes_a_run       Parquet size per identification with the default columns
 worker_mb         largest memory of a worker in the empty runs; scheduler_mb: of the process with scheduler and
                   writer; *_growth: increase from the first tenth of the runs to the end
-rows              number of rows of the empty runs; -1 if it is wrong
+rows              number of rows of the empty runs; -1 if rows are missing or duplicated
 seconds_a_run     processor time of a short identification, and wall time per identification with 1, 2 and 4 workers
 """
 
@@ -62,7 +62,7 @@ def study_file(folder: Path, text: str) -> Path:
 
 
 def timed(path: Path, out: Path, workers: int) -> tuple[float, Dataset]:
-    """Return the wall time per run [s] and the rows; excludes each worker's first run, which includes compilation."""
+    """Return the wall time per run [s], without each worker's first run, which includes compilation, and the rows."""
     seen: list[float] = []
     dataset = run_study(load_study(path), out, worker_count=workers, watch=lambda _: seen.append(time.perf_counter()))
     first = min(2 * workers, len(seen) - 1) - 1
@@ -145,7 +145,7 @@ def empty_runs(folder: Path, runs: int) -> dict[str, Any]:
 
 
 def killed(folder: Path, runs: int) -> dict[str, Any]:
-    """Count the rows that are lost or duplicated when workers are killed `KILLS` times, then the engine is killed and
+    """Count the rows that are lost or duplicated if workers are killed `KILLS` times, the engine is then killed, and
     the study is resumed.
     """
     path = study_file(folder, IDENTIFY.format(runs=runs))

@@ -38,12 +38,14 @@ class BusConfig:
     """Where the servos are connected and how to communicate with them.
 
     url: device or pyserial URL.
-    one_write: send Sync Write and group read in one write; False if `hil check` finds that the arm needs two.
-    fast_sync_read: use Fast Sync Read if the firmware of every servo supports it.
+    one_write: whether to send Sync Write and group read in one write; False if `hil check` finds that the arm needs two
+    writes.
+    fast_sync_read: whether to use Fast Sync Read if the firmware of every servo supports it.
     slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
     voltage plus temperature.
-    watchdog_required: reject firmware without Bus Watchdog.
-    take_over: if torque is already on, let the arm sink slowly and cut torque instead of refusing to start.
+    watchdog_required: whether to reject firmware without Bus Watchdog.
+    take_over: whether to let an arm whose torque is already on sink slowly, and then cut torque, instead of refusing to
+    start.
     interval: time between two samples [s]; 0 if the rate is not fixed, in which case the servos' status is not read.
     """
 
@@ -87,7 +89,7 @@ class ServoBus(TorqueSwitch):
         self._of = tuple(index for index, joint in enumerate(self.joints) for _ in joint.drives)
         self._in_pairs = len(self._drives) > len(self.joints)
         self._measured = self._drives
-        """The entries of `_drives`; `prepare` shifts their zeros to the present turn."""
+        """Like `_drives`, but `prepare` shifts the zeros to the servos' present turn."""
         self._exchange: ReadBackExchange | None = None
         self.exchanges_per_sample = 1
         """Number of exchanges per sample, chosen by `prepare` so that they are at most CHECK_S apart if possible."""
@@ -145,9 +147,10 @@ class ServoBus(TorqueSwitch):
         return {drive for drive, answer in answers if answer is None or len(answer) == 1}
 
     def learn_latency(self) -> None:
-        """Lower the adapter's latency timer, and measure whether the adapter is slower than its kind; raises PortLost.
+        """Lower the adapter's latency timer, and measure whether the adapter is slower than expected for its type.
 
-        Until then, replies of a slow adapter may be taken for those to the next request.
+        Before this has been called, late replies through a slow adapter may be mistaken for replies to the next
+        request. Raises PortLost.
         """
         self.port.lower_latency()
         learn_latency(next(iter(self._servos.values())))
@@ -192,7 +195,7 @@ class ServoBus(TorqueSwitch):
     ) -> LetDown:
         """Ensure that every servo's torque is off before anything is written.
 
-        If it is not, raises TorqueHeld, or lets the arm sink if `BusConfig.take_over` is set (`let_sink`).
+        If torque is on, raises TorqueHeld or, if `BusConfig.take_over` is set, lets the arm sink (`let_sink`).
         ours: joints whose torque was left on by a program that this user ran earlier; that torque is cut immediately.
         before_lowering: called with the joints that are about to be let down, before anything is written to their
         servos; returns the `originals` of `let_sink`.
@@ -258,10 +261,10 @@ class ServoBus(TorqueSwitch):
     ) -> ReadBackExchange:
         """Return an exchange with these servos, after reading their Return Delay Times.
 
-        fast: use Fast Sync Read instead of Sync Read.
-        one_write: send the goals and the read request in one write instead of two.
-        slow_every: cycles between two slow reads; by default `BusConfig.slow_every`.
-        status: read the servos' status periodically, if there is time.
+        fast: whether to use Fast Sync Read instead of Sync Read.
+        one_write: whether to send the goals and the read request in one write instead of two.
+        slow_every: number of cycles between two slow reads; by default `BusConfig.slow_every`.
+        status: whether to read the servos' status periodically if there is time.
         patience: minimum time to wait for replies before they count as lost [s].
         """
         servos = self._servos.values()
@@ -358,10 +361,10 @@ class ServoBus(TorqueSwitch):
 
     @property
     def watchdog_changed(self) -> tuple[int, int] | None:
-        """Index of a joint whose Bus Watchdog had changed when last read back, and its value [20 ms]; None if there is
-        none.
+        """Index of a joint whose Bus Watchdog had changed when it was last read back, and the value read [20 ms]; None
+        if there is no such joint.
 
-        Tripping does not count as a change, since a pause between this program's packets can also cause it.
+        A tripped watchdog does not count as changed, since a pause between this program's packets can also trip it.
         """
         expected = self.armed_ticks, WATCHDOG_TRIPPED
         for place, ticks in self.prepared.watchdogs:

@@ -89,7 +89,7 @@ def _what_is_installed() -> str:
     except PackageNotFoundError:
         return f"{needed}, which is not installed. Install hil again, with its dependencies."
     return (
-        f"{needed}, but {installed} is installed, probably because another package needs an older one. Give hil an "
+        f"{needed}, but {installed} is installed, probably because another package needs an older version. Give hil an "
         'environment of its own and start its fake arms with hil fake --pty: see docs/fake_bus_in_ci.md, "Programs '
         'that need an older dynamixel-sdk".'
     )

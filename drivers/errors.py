@@ -25,9 +25,9 @@ __all__ = [
 class DriverError(Exception):
     """Base class of all errors raised by the servo drivers.
 
-    last_samples: the last samples that an experiment recorded before the error, if one was running. in_doubt: the
-    registers that may not have been restored, if all others are known to have been restored. after_torque: whether
-    the error occurred after torque had been switched on, so that it does not count as wrong input.
+    last_samples: the last samples recorded before the error, if an experiment was running. in_doubt: the registers that
+    may not have been restored; empty unless all other registers are known to have been restored. after_torque: whether
+    the error occurred after torque had been switched on, in which case it does not count as wrong input.
     """
 
     last_samples: object = None
@@ -81,8 +81,8 @@ class ServoRefused(DriverError):
 
 
 class TorqueDoubted(ServoRefused):
-    """Torque Enable reads as off, but the EEPROM is locked as if torque were on. Example: the register does not show
-    what the servo does.
+    """Torque Enable reads as off, but the EEPROM is locked as if torque were on. Example: a servo that keeps its torque
+    on although the register reads 0.
     """
 
 
@@ -115,4 +115,4 @@ class TorqueHeld(WrongSetting):
 
 
 class TorqueNotOff(DriverError):
-    """Torque off could not be confirmed for every servo: cut the power. Example: the cable was unplugged."""
+    """Torque off could not be confirmed for every servo, so the power must be cut. Example: the cable was unplugged."""

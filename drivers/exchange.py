@@ -37,8 +37,8 @@ MOST_PATIENCE_S = 0.02
 """Upper limit of the minimum reply timeout [s]: even in slow cycles, a silent servo must not delay the others."""
 
 AFTER_LOSS = 5
-"""Number of reads of different lengths that are used in turn after a lost reply. A reply that arrives fewer than this
-many cycles late is recognised by its length.
+"""Number of reads of different lengths that are used in turn after a lost reply. The length of a late reply then shows
+which request it belongs to, provided that it is late by fewer cycles than this number.
 """
 
 REMEMBERED = 128
@@ -74,8 +74,8 @@ class Exchange:
     goal: the goal register, or one per servo.
     spans, status: registers to read; each is one span for all servos, or one per servo.
     return_delay: the longest Return Delay Time of the servos [s].
-    fast: read with Fast Sync Read.
-    one_write: send both packets in one write instead of two.
+    fast: whether to read with Fast Sync Read.
+    one_write: whether to send both packets in one write instead of two.
     slow_every: number of cycles between two reads of a slow span, i.e. one of `spans[1:]`.
     status_every: number of cycles between two status reads; there are none if `status` is None.
     interval: time between two cycles [s], 0 if unknown; the longer it is, the longer a cycle can wait for a reply.
@@ -112,7 +112,7 @@ class Exchange:
         self.fast = fast
         self.one_write = one_write
         self._is_plain = one_write and not self._echoes
-        """Whether goals and request are sent in one write and are not echoed."""
+        """Whether goals and request are sent in one write, and the adapter does not echo them."""
         self._writes = [
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
@@ -144,7 +144,7 @@ class Exchange:
         self._late_possible = False
         self._after_loss = 0
         self._cut_off = b""
-        """The part of a reply received before the latest exchange timed out."""
+        """Incomplete reply received before the latest exchange timed out."""
         self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
         self._took = math.inf
         """Duration of the latest cycle [s]."""
@@ -187,8 +187,8 @@ class Exchange:
         return self._port.reply_time(plan.reply_time.timeout + seconds, self._sent_bytes(plan.read))
 
     def accept_any_order(self) -> None:
-        """From now on, accept answers in any order. Use this only if all replies to one request have arrived, or count
-        as lost, before the next request: nothing else shows which request an answer belongs to.
+        """From now on, accept answers in any order. Use this only if the next request is not sent before all replies to
+        the previous one have arrived or count as lost: nothing else shows which request an answer belongs to.
         """
         for plan in self._plans:
             if isinstance(plan.read, SyncRead):
@@ -217,7 +217,7 @@ class Exchange:
         try:
             if write is None:
                 sent = self._pack_each(goal_ticks) + read.request
-            else:  # as `_GoalWrite.pack`, without its frame and with the request behind its CRC
+            else:  # the inlined code of `_GoalWrite.pack`, which also appends the request to the CRC
                 fields = write.fields
                 fields[2::2] = goal_ticks
                 sent = write.pack_fields(*fields)
@@ -263,9 +263,10 @@ class Exchange:
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
         """Handle replies that arrive sooner than the wire time allows: they may belong to an earlier request.
 
-        A duplicated reply is still in the input when the next request is sent; if it were used, every later reply
-        would be one cycle old. If the true reply follows, it is used. Otherwise, the port is not a real serial line
-        but, say, a pty, and after a few such cases this check is switched off.
+        A duplicate of an earlier reply is still in the input when the next request is sent. If it were used, every
+        later reply would be one cycle old. If another reply follows, it is the true one and is used instead. If none
+        follows, the port is probably not a real serial line but, for example, a pty; after a few such cases, this check
+        is switched off.
         """
         received = self._port.read(read.reply_size, max(0.0, deadline - self._now()))
         if not received:
@@ -281,8 +282,8 @@ class Exchange:
             if self._port.has_input():
                 self._port.put_aside()
             # A reply that arrives even later must not be taken for the reply to this request. Nothing in a packet
-            # identifies the request it belongs to, but its length differs if another span was requested. Where several
-            # replies in a row are late, each request needs a length of its own.
+            # identifies the request it belongs to, but its length differs if another span was requested. As several
+            # replies in a row may be late, each request needs a length of its own.
             self._after_loss = self._after_loss % AFTER_LOSS + 1
             span = self._kinds - 1 + self._after_loss
         else:
@@ -352,10 +353,10 @@ class Exchange:
 class _Plan:
     """One of the group reads of an exchange.
 
-    span: the span that a Reply reports. reply_time: how long to wait for the replies. pack_behind: packs the goals' CRC
-    and the request. wire_s: wire time of goals, request and replies [s]. soonest: if a complete reply arrives within
-    this time after the start of the cycle, it may belong to an earlier request [s]. is_after_loss: whether a late reply
-    may be on the wire when this read is sent, and may destroy the goals.
+    span: index of the span, as given in a Reply. reply_time: how long to wait for the replies. pack_behind: function
+    that packs the goals' CRC and the request. wire_s: wire time of goals, request and replies [s]. soonest: time after
+    the start of the cycle [s]; a complete reply that arrives sooner may belong to an earlier request. is_after_loss:
+    whether a late reply may be on the wire when this read is sent, and may then destroy the goals.
     """
 
     read: GroupRead
@@ -381,8 +382,8 @@ class _GoalWrite:
         self.size = packet.size + 2
 
     def pack(self, goal_ticks: Sequence[int]) -> bytes:
-        """Return the packet for these goals, one per servo in `places`; raises struct.error for a goal that is too
-        large, ValueError or struct.error for the wrong number of goals.
+        """Return the packet for these goals, one per servo in `places`. Raises struct.error for a goal that is too
+        large, and ValueError or struct.error for a wrong number of goals.
         """
         fields = self.fields
         fields[2::2] = goal_ticks

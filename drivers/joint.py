@@ -12,7 +12,7 @@ __all__ = ["Joint", "SecondServo"]
 class SecondServo(NamedTuple):
     """An additional servo on a joint.
 
-    id: its bus ID.
+    id: the servo's bus ID.
     direction: +1 or -1, the joint's sense of rotation relative to this servo's.
     """
 
@@ -48,7 +48,7 @@ class Joint:
 
     @property
     def drives(self) -> tuple["Joint", ...]:
-        """The joint split into single-servo joints, one per servo."""
+        """Single-servo joints that together represent this joint, one per servo."""
         first = replace(self, seconds=())
         return first, *[replace(first, id=servo_id, direction=sign, near=None) for servo_id, sign in self.seconds]
 

@@ -13,7 +13,7 @@ class Tick(NamedTuple):
 
     deadline: when the wait should have ended [s, on the clock].
     now: when it ended [s].
-    missed: whether it ended at least a whole interval late; if so, the caller should skip this sample.
+    missed: whether the wait ended at least one whole interval late; if so, the caller should skip this sample.
     """
 
     deadline: float

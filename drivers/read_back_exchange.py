@@ -16,7 +16,7 @@ from hil.drivers.others.read_back import (
 from hil.drivers.sync_read import Answer, GroupRead, Span
 
 _LATE_SHARE = 0.25
-"""Fraction of `ReadBackExchange._overtime` by which the reply to any read-back may be late."""
+"""Time by which the reply to any read-back may be late, as a fraction of `ReadBackExchange._overtime`."""
 
 
 class ReadBackExchange(Exchange):
@@ -89,10 +89,10 @@ class ReadBackExchange(Exchange):
         return self.torque_off
 
     def read_back_every(self, off_wire: float) -> tuple[float, float]:
-        """Return the expected time between two read-backs of a goal [s] (0 if most cycles leave time for one), and the
-        duration of the shortest cycle that leaves time for one [s].
+        """Return the expected time between two read-backs of a goal [s] (0 if most cycles leave time for a read-back),
+        and the duration of the shortest cycle that leaves time for a read-back [s].
 
-        off_wire: duration of an exchange in addition to its wire time [s].
+        off_wire: duration of an exchange beyond its wire time [s].
         """
         back = self._read_back
         if back is None or not self._interval:
@@ -121,7 +121,7 @@ class ReadBackExchange(Exchange):
         if back is None or not self._sent:
             return None
         if back.kind != GOALS:
-            # Only goals are overwritten by the next cycle. If there is time for them as well, they are read last.
+            # Of all that is read back, the next cycle overwrites only the goals. They are read last if there is time.
             before_goals = due - self._takes(back.reads[GOALS], back) - HOST_S
             if self._now() + self._takes(back.read, back) <= before_goals:
                 found = self._held(back, before_goals)
@@ -148,7 +148,7 @@ class ReadBackExchange(Exchange):
         if now + takes > end or self._late_possible:
             back.postponed(now)
             if back.kind != GOALS and not self._late_possible and now + self._takes(back.shortest, back) <= due:
-                back.kind = GOALS  # which take less time; what is due remains due
+                back.kind = GOALS  # they take less time to read; the other registers remain due
                 return self._held(back, due)
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
             left_less_time = self._latest_plan is not self._usual
@@ -166,7 +166,7 @@ class ReadBackExchange(Exchange):
             self.awaited_until = now
         # If nothing at all arrived, the reply may be late and would be mistaken for the reply to a repeated read.
         if None in servos and self.heard.latest and back.may_repeat(now, takes):
-            # The packet of another master may have destroyed the reply, and the next cycle overwrites what it wrote.
+            # A packet from another master may have destroyed the reply, and the next cycle overwrites its goals.
             self.awaited_until = now + takes + self._wire_s[read]
             servos = self._ask_back(read, now, self.awaited_until - now)
         self.read_back_at = now
@@ -181,7 +181,7 @@ class ReadBackExchange(Exchange):
         found = back.look(servos, self._sent, now, collided=self._latest_plan.is_after_loss, alone=alone)
         back.delayed(now, max(0.0, now - due), alone=alone)
         if back.is_unexpected:
-            self.read_status_next()  # it distinguishes lost goals from another master's
+            self.read_status_next()  # the status distinguishes lost goals from another master's goals
         return found
 
     def _ask_back(self, read: GroupRead, start: float, timeout: float) -> list[Answer]:
@@ -198,7 +198,7 @@ class ReadBackExchange(Exchange):
         self.heard.latest = received
         servos = read.unpack(received)
         if servos is None:
-            # A master that writes between two cycles is heard here, and nowhere else if the next reply is complete.
+            # A master that writes between two cycles is heard only here if the reply in the next cycle is complete.
             servos = read.search(received)[0]
             self.heard.beside(received, echoes=self._echoes)
         return servos

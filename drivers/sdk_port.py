@@ -27,7 +27,7 @@ class SdkPort:
     def __init__(self, port: Port) -> None:
         self._port = port
         self.patience = PATIENCE_S
-        """How long to wait beyond wire time [s]."""
+        """How long to wait for a reply beyond its wire time [s]."""
         self._deadline = 0.0
         self._sent = b""
         """The last bytes written, kept as long as their echo may still arrive."""
@@ -53,7 +53,7 @@ class SdkPort:
             port.overheard = b""
 
     def hear(self, received: bytes) -> None:
-        """Count the late replies and another master's instructions in bytes outside the expected reply."""
+        """Count late replies and other masters' instructions among bytes that are not part of the expected reply."""
         if received and not self._port.echoes:
             for packet in Framer().feed(received):
                 self._port.late_replies += packet.is_status
@@ -84,7 +84,7 @@ class SdkPort:
         return max(0.0, self._deadline - self._port.clock.now())
 
     def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
-        # Twice the reply's wire time: once for the instruction before it, once for the reply.
+        # Twice the reply's wire time: the instruction that precedes the reply takes about as long.
         self._set_timeout(2 * self._port.wire_time(packet_length) + max(self.patience, self._port.latency + 2e-3))
 
     def setPacketTimeoutMillis(self, msec: float) -> None:  # noqa: N802
@@ -124,10 +124,10 @@ class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 
 
 def _first_status(received: bytes) -> tuple[bytes, int]:
-    """Return the first intact status packet among the received bytes, and 0 as the number of bytes to read next.
+    """Return the first intact status packet among the received bytes, and 0, since no more bytes need to be read.
 
-    If there is none, return b"" and a number of bytes to read that does not reach beyond the incomplete packet, so that
-    the next packet is not split.
+    If there is no such packet, return b"" and the number of bytes to read next. This number does not reach beyond the
+    incomplete packet, so that the next packet is not split.
     """
     missing = _SHORTEST - next(size for size in range(len(HEADER) - 1, -1, -1) if received.endswith(HEADER[:size]))
     at = received.find(HEADER)

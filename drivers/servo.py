@@ -1,7 +1,7 @@
 """One servo on a port, for set-up work: pings, and register reads and writes by name, with up to three attempts each.
 
 Everything goes through the packet handler of `dynamixel-sdk`. Writes are read back, because a status packet only
-confirms that the instruction was understood, not what the register now holds.
+confirms that the instruction was understood, and does not show what the register now holds.
 """
 
 from collections.abc import Callable
@@ -74,10 +74,10 @@ class Servo:
         return self.read_entry(self.table[register], attempts, despite_error=True)
 
     def read_surely(self, register: str) -> int:
-        """Read a register twice like `read_despite_error`, with the servo's ID in between, until the readings agree.
+        """Read a register twice like `read_despite_error`, reading the servo's ID in between, until the readings agree.
 
-        A reply does not identify its register: a late one, or one that another device repeats, may belong to an earlier
-        request. Raises InconsistentReplies if they never agree, and the errors of `read`.
+        A reply does not identify its register: a late reply, or one that another device repeats, may belong to an
+        earlier request. Raises InconsistentReplies if the readings never agree, and the errors of `read`.
         """
         for _ in range(_SURE_ATTEMPTS):
             first = self.read_despite_error(register)
@@ -124,11 +124,11 @@ class Servo:
         return entry.decode(bytes(self._try(f"reading {entry.name}", ask, attempts, is_read=True)))
 
     def write(self, register: str, value: int, attempts: int | None = None) -> None:
-        """Write a register and read it back. Raises the errors of `read`, and ServoRefused if it reads back as a
+        """Write a register and read it back. Raises the errors of `read`, and ServoRefused if the register then holds a
         different value.
 
-        attempts: maximum number of attempts at the write, and then at the read; by default, the number used for all
-        set-up work.
+        attempts: maximum number of attempts, for the write and for the read separately; by default, the same number as
+        for all set-up work.
         """
         self._write_and_read_back(register, value, attempts, despite_error=False)
 
@@ -141,8 +141,8 @@ class Servo:
         self._write_and_read_back(register, value, None, despite_error=True)
 
     def write_once(self, register: str, value: int) -> None:
-        """Write a register like `write_despite_error`, but try only once; if the write itself is not answered, raise
-        NoReply without sending anything more.
+        """Write a register like `write_despite_error`, but try only once. If the write itself is not answered, send
+        nothing more and raise NoReply.
         """
         with suppress(ServoRefused):
             self.write_only(register, value, attempts=1)
@@ -187,7 +187,9 @@ class Servo:
         self._try(f"writing {value} to {register}", send, attempts)
 
     def let_answer(self) -> None:
-        """Set Status Return Level to 2 if the servo answers pings, as it does at level 0. Raises `ping`'s errors."""
+        """Set Status Return Level to 2 if the servo answers pings, which it does even at level 0. Raises the errors of
+        `ping`.
+        """
         self.ping(attempts=1)
         with suppress(NoReply):
             self.write_only("Status Return Level", 2, attempts=1)

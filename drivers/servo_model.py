@@ -50,13 +50,13 @@ supply voltage: supplies sag, and resistance and no-load speed differ by tens of
 """
 
 LEAST_OF_MEASURED = 0.75
-"""Replaces `LEAST_SUPPLY` if the supply was measured. It is not 1, because motors differ and the supply may sag between
-two readings.
+"""Replaces `LEAST_SUPPLY` if the supply was measured. It is less than 1 because motors differ and the supply may sag
+between two readings.
 """
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
-"""The first value is a fraction of the goal: if the current is lower, torque may simply be off. In that case, the
-second value replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
+"""If the current is below the first value, a fraction of the goal, torque may simply be off. In that case, the second
+value replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
 """
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
@@ -97,8 +97,8 @@ class NoLoad(NamedTuple):
 class Published(NamedTuple):
     """A published torque constant: the median, lowest and highest of the published values.
 
-    It is uncertain even where these values agree: an individual servo's stall torque can differ by tens of percent. If
-    that matters, measure the constant with a known weight.
+    The constant is uncertain even where the published values agree, since an individual servo can deviate from them by
+    tens of percent. If that matters, measure the constant with a known weight.
     """
 
     value: float
@@ -118,7 +118,7 @@ class ServoModel:
     position_steps: ticks of Present Position per turn.
     min_voltage: supply voltage below which the servo shuts down with factory settings (Min Voltage Limit) [V].
     watchdog_firmware: first firmware with a Bus Watchdog.
-    fast_sync_read_firmware: first firmware that supports Fast Sync Read; None if none does.
+    fast_sync_read_firmware: first firmware that supports Fast Sync Read; None if the model never supports it.
     senses_supply: whether Present Current is the supply current, that is, the motor current times the bridge's duty
     cycle, which is far less than the commanded current while the joint moves slowly. This is true of the 330 series
     (e-Manual, Current Limit: the XL330 "measures current at its input power source").

@@ -2,8 +2,8 @@
 
 Based on identified X-series servos: Rhoban's bam (dry friction 1.2 to 2.5 % of stall torque, small servos up to 7 %)
 and published models of XM430 arms (armature 0.005 to 0.012 kg m^2, viscous friction 0.02 to 0.06 N m s/rad at a stall
-torque of 4.1 N m). Small servos with plastic gears vary most. None of these values was measured here, hence
-the wide spreads.
+torque of 4.1 N m). Small servos with plastic gears vary most. The spreads are wide because none of these values was
+measured in this project.
 """
 
 from dataclasses import dataclass

@@ -55,9 +55,10 @@ class State(NamedTuple):
     position: joint angle [rad].
     error: the ERR bytes, 0 if missing.
     missing: whether the servo returned no values.
-    slow, status: values that are only read in some cycles, otherwise None.
-    apart: for each joint, the angles of its additional servos minus the first's [rad], NaN if one did not reply; None
-    on an arm with one servo per joint. Horns may be mounted at any angle, so only a change is meaningful.
+    slow, status: values that are only read in some cycles; None in all other cycles.
+    apart: for each joint, the angles of its additional servos minus that of its first servo [rad], NaN if a servo did
+    not reply; None for an arm with one servo per joint. Horns may be mounted at any angle, so only a change in these
+    values is meaningful.
     """
 
     time_before_write: float
@@ -115,8 +116,8 @@ _DRIVEN = ("Torque Enable", "Hardware Error Status")
 def status_span(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable], *, whole: bool) -> Spans:
     """Return the registers that show whether torque and watchdog are still on, plus the state.
 
-    mode: drive mode of all servos, or one per servo. whole: start at Torque Enable; otherwise start at Bus Watchdog,
-    which halves the number of bytes.
+    mode: drive mode of all servos, or one per servo. whole: whether to start at Torque Enable; otherwise, the span
+    starts at Bus Watchdog, which halves the number of bytes.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
     names = [(*_DRIVEN, *_status_names(own)) if whole else _status_names(own) for own in modes]
@@ -134,11 +135,11 @@ rebooting the servo.
 
 
 def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans, Spans]:
-    """Return the span of registers that ends with the goal, the one that ends with SETTINGS, and the one that begins
-    with Torque Enable.
+    """Return three spans of registers: the first ends with the goal, the second ends with SETTINGS, and the third
+    begins with Torque Enable.
 
-    They cover more addresses than necessary, so that the answers differ in length from those to other programs'
-    usual requests.
+    The spans cover more addresses than necessary, so that answers to these reads differ in length from answers to the
+    usual requests of other programs.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
     goals = [_status_names(own)[:2] for own in modes]
@@ -256,9 +257,10 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
     """Combine the values of the servos into one value per joint.
 
     of: the joint index of each servo, in ascending order. count: number of joints.
-    Goals and currents are summed; angle, velocity and clock are the first servo's; the lowest voltage and the highest
-    temperature are taken; an error or missing reply of one servo applies to its joint. `apart` shows by how much the
-    servos of one joint disagree.
+
+    Goals and currents are summed. Angle, velocity and clock are those of the joint's first servo; voltage is the lowest
+    and temperature the highest of its servos. If any servo reports an error or does not reply, this applies to its
+    joint. `apart` shows by how much the servos of one joint disagree.
     """
     servos = [[place for place, joint in enumerate(of) if joint == wanted] for wanted in range(count)]
     first = [places[0] for places in servos]

@@ -49,10 +49,10 @@ class Span:
 
     @classmethod
     def each(cls, tables: Sequence[ControlTable], registers: Sequence[Sequence[str]]) -> "tuple[Span, ...]":
-        """Return one span per table, with `registers[i]` of `tables[i]`, all covering the same range of addresses.
+        """Return one span per table: span i decodes `registers[i]` of `tables[i]`, and all cover the same addresses.
 
-        A servo refuses a read that ends at an undefined address. Raises KeyError if a table lacks one of its registers,
-        ValueError if there is no such range.
+        The common range ends at an address that every table defines, since servos refuse other reads. Raises KeyError
+        if a table lacks one of its registers, and ValueError if there is no common range.
         """
         own = [cls._in(table, names) for table, names in zip(tables, registers, strict=True)]
         start = min(span.address for span in own)
@@ -108,7 +108,9 @@ class GroupRead(Protocol):
     expected: frozenset[tuple[int, int]]
 
     def unpack(self, received: bytes) -> list[Answer] | None:
-        """Decode a regular reply, in which every servo answered and nothing was stuffed; return None for any other."""
+        """Decode a regular reply, i.e. one in which every servo answered and no byte was stuffed; return None for any
+        other reply.
+        """
         ...
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
@@ -133,7 +135,7 @@ class SyncRead:
     def __init__(self, ids: Sequence[int], span: Span | Sequence[Span]) -> None:
         self._ids = tuple(ids)
         self.in_any_order = False
-        """Whether answers are accepted in any order, as is necessary if only some of them are late."""
+        """Whether answers are accepted in any order, which is necessary if only some of them are late."""
         spans = one_each(span, len(self._ids))
         self._values = {servo_id: Struct(f"<B{own.format}") for servo_id, own in zip(ids, spans, strict=True)}
         span = spans[0]
@@ -179,15 +181,15 @@ class SyncRead:
             if packet.is_status and packet.id in self._ids and (answer := self._answer(packet)):
                 turn = self._ids.index(packet.id)
                 if turn <= latest:
-                    # Servos answer in order, so the earlier ones belong to an earlier request,
-                    # or a servo has answered with another one's ID.
+                    # Servos answer in order, so the answers so far belong to an earlier request,
+                    # or a servo has answered with another servo's ID.
                     found.clear()
                     is_repeated = True
                 found[packet.id], latest = answer, turn
         # Servos answer in order, so nothing follows the last one.
         is_over = self._ids[-1] in found
         if is_repeated and len(found) < len(self._ids):
-            found.clear()  # whose answers these are is unknown
+            found.clear()  # it is unknown whose answers these are
         return [found.get(servo_id) for servo_id in self._ids], is_over
 
     def _search_any_order(self, received: bytes) -> tuple[list[Answer], bool]:
@@ -212,7 +214,7 @@ class SyncRead:
 class FastSyncRead:
     """A Fast Sync Read: each servo appends `ERR ID data CRC` to one status packet, which is never stuffed.
 
-    Each CRC covers everything from the packet's header on, so the last one covers the whole packet.
+    Each CRC covers everything from the packet's header to that CRC, so the last one covers the whole packet.
     """
 
     def __init__(self, ids: Sequence[int], span: Span | Sequence[Span]) -> None:

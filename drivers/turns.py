@@ -7,10 +7,10 @@ NEVER = 1 << 62
 
 
 class Turns:
-    """Counts cycles until spans other than the usual one are due.
+    """Counts cycles until a span other than the usual one is due.
 
-    `plan` returns the number of usual cycles that remain until then. In each cycle, the caller only decrements this
-    number, from which `count` derives how many cycles have passed.
+    `plan` returns the number of cycles until then, in which the usual span is read. To save time, the caller merely
+    decrements this number in each cycle; `count` derives from it how many cycles have passed.
 
     slow_spans: number of slow spans. slow_every: samples between two slow reads. status_every: cycles between two
     status reads.
@@ -27,7 +27,7 @@ class Turns:
         """Number of cycles since the previous sample that have not yet been counted."""
 
     def count(self, left: int) -> None:
-        """Count the cycles run so far. left: number of planned cycles not yet run (-1 if one more has been run)."""
+        """Count the cycles run so far. left: number of planned cycles not yet run; -1 if one too many has been run."""
         passed = self.usual - left
         self._until_status -= passed
         self._until_slow -= passed - self.between
@@ -55,6 +55,6 @@ class Turns:
             self._until_status = min(self._until_status, 1)
 
     def plan(self) -> int:
-        """Return the minimum number of usual cycles before another span is due; cycles between samples may delay it."""
+        """Return the minimum number of cycles before another span is due. Cycles between samples may add to this."""
         self.usual = max(0, min(self._until_slow, self._until_status) - 1)
         return self.usual

@@ -32,7 +32,7 @@ from hil.fakes.plants.errors import PlantError
 SCHEME = "fake://"
 REAL_TIME = "?time=real"
 _LIKE_NO_PARITY = (serial.PARITY_NONE, serial.PARITY_MARK)
-"""Parities that a receiver without parity understands: it takes the bit of mark parity for a stop bit."""
+"""Parities with which a receiver without parity still reads the bytes: a mark parity bit looks like a stop bit."""
 
 
 class _Unplugged(serial.SerialException):
@@ -143,15 +143,16 @@ class FakeSerial(SerialBase):
     def write(self, data: bytes | bytearray) -> int:  # type: ignore[override]  # pyserial's stub allows any buffer
         """Put bytes on the wire and return immediately, like a buffered driver.
 
-        Servos reject bytes with another frame than 8N1. Zeros stand for them: they take as long and contain no packet.
+        Servos reject bytes in a frame format other than 8N1. Such bytes are replaced by zeros, which take the same time
+        and contain no packet.
         """
         self._open_bus().write(bytes(data) if self._is_understood else bytes(len(data)))
         return len(data)
 
     def wait(self, seconds: float) -> None:
-        """Let the arm run for this long on `clock`: at once in virtual time. `bus` is then up to date.
+        """Let the arm run for this time on `clock` (instantly in virtual time), and bring `bus` up to date.
 
-        Bytes that arrive meanwhile can still be read. pyserial's own ports have no such method.
+        Bytes that arrive in the meantime can still be read afterwards. pyserial's own ports have no such method.
         """
         if not 0.0 <= seconds < math.inf:
             raise ValueError(f"cannot wait for {seconds} s")

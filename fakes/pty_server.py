@@ -32,7 +32,7 @@ OVERRUN_S = 1e-3
 
 TOO_SLOW_S = 5e-3
 """Largest acceptable excess of computing time over simulated time in one pass of the server's loop [s]. If two
-consecutive passes exceed it, the time beyond it is not simulated.
+consecutive passes exceed this limit, the time beyond the limit is not simulated.
 """
 
 LONGEST_SLEEP_S = 0.05
@@ -87,8 +87,8 @@ class PtyServer:
     """Serves one fake arm on a pseudo-terminal; `serve` runs until `stop` is called from a thread or signal handler.
 
     link: symbolic link to create for the terminal. A link left behind by a killed server is replaced; LinkError is
-    raised if anything else is at that path, or if a running server uses the link. `bus` may be inspected, and its hand
-    moved, from another thread that holds `lock`; from another process, `hil hand` moves it.
+    raised if anything else is at that path, or if a running server uses the link. Another thread that holds `lock` may
+    inspect `bus` and use its hand; another process can use the hand with `hil hand`.
     """
 
     def __init__(self, description: FakeArm, link: Path | None = None) -> None:
@@ -156,7 +156,7 @@ class PtyServer:
                 elif not ready:
                     self.bus.advance(now())
                 self._mind_the_cable()
-                # On a machine too slow for the arm the delay would keep growing, so the arm's time slows down instead.
+                # On a machine too slow for the arm, the delay would keep growing; instead, the arm's time slows down.
                 taken = time.monotonic() - began
                 lived = self.bus.advanced_to - reached
                 excess = taken - lived
@@ -195,7 +195,7 @@ class PtyServer:
             try:
                 os.write(self._master, data)
             except BlockingIOError:
-                self._overruns += 1  # nobody reads: lost, as with a full adapter buffer
+                self._overruns += 1  # nobody reads, so the bytes are lost, as with a full adapter buffer
 
     def _mind_the_cable(self) -> None:
         self.bus.notice_faults()
@@ -217,7 +217,7 @@ class PtyServer:
                 self._link, taken = (
                     None,
                     self._link,
-                )  # created by another program, so it must not be removed at the end either
+                )  # created by another program, so `close` must not remove it
                 self.close()
                 raise LinkError(
                     f"{taken} was created by another program while the cable was unplugged and is left as it is. "
@@ -246,10 +246,9 @@ class PtyServer:
 
 
 def _claim(link: Path) -> socket.socket:
-    """Claim a link until the socket is closed or the process dies, and remove the link if a killed server left it
-    behind.
+    """Claim a link, and remove it if a killed server left it behind. Raises LinkError if it cannot be used.
 
-    The claim is an abstract Unix socket, which the system then frees. Raises LinkError if the link cannot be used.
+    The claim is an abstract Unix socket. It ends when this socket is closed or the process dies.
     """
     path = os.fsencode(link.parent.resolve() / link.name)
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

@@ -1,7 +1,7 @@
 """Call one client's functions on a fake arm; print the results as one line of JSON. Arguments: CLIENT DEVICE.
 
-This script runs in any environment that has the client and does not import hil; `benchmarks/bus/clients.py` calls
-it. A call is wrong if it raises or if its result differs from that of a real servo.
+This script is run by `benchmarks/bus/clients.py`. It does not import hil, so it runs in any environment that has the
+client. A call is wrong if it raises or if its result differs from that of a real servo.
 """
 
 import builtins
@@ -122,7 +122,7 @@ def dynamixel_easy_sdk(device: str) -> Iterator[Call]:
 
 
 def rustypot(device: str) -> Iterator[Call]:
-    """Calls made with rustypot to fake_two_link, through its XL430 controller: the register addresses are the same."""
+    """Calls made with rustypot to fake_two_link, through its XL430 controller, which uses the same addresses."""
     import rustypot as library
 
     client = library.Xl430PyController(device, BAUD, 0.5)
@@ -176,7 +176,7 @@ def pypot(device: str) -> Iterator[Call]:
     """Calls that pypot makes on xl320, an arm of two XL-320, the only servos with which pypot uses Protocol 2.0."""
     from pypot.dynamixel import Dxl320IO
 
-    # It flushes unsent output before each packet, which on a pty would drop a Sync Write that has not been read yet.
+    # pypot discards pending output before each packet; on a pty, this would drop a Sync Write that is still unread.
     importlib.import_module("serial").Serial.flushOutput = lambda _: None
     io = Dxl320IO(device, baudrate=BAUD, timeout=0.3)
     yield "ping", lambda: io.ping(1), True

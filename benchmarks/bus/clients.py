@@ -83,7 +83,7 @@ def served(arm: str) -> Iterator[str]:
 
 
 def run(name: str, pythons: Sequence[str]) -> dict[str, Any]:
-    """Run one client in the first of these environments that has it."""
+    """Run one client in the first of these Python environments in which it is installed."""
     outcome: dict[str, Any] = {"client": name, "missing": CLIENTS[name][1]}
     hil = [sys.executable, "-m", "hil"]
     environment = {**os.environ, "HIL": json.dumps(["env", f"PYTHONPATH={ROOT}", *hil])}

@@ -2,7 +2,7 @@
 
     python benchmarks/bus/conversations.py [--conversations N] [--seed S] [--json]
 
-The host is `conversation` with `codec`; the expected answers come from `servo_rules`. None of them uses the fake's
+The host is `conversation` with `codec`; the expected answers come from `servo_rules`. None of these uses the fake's own
 code. A conversation takes place in virtual time and has one to four servos with random models, IDs, firmware, Return
 Delay Time and Status Return Level. It consists of 10 to 30 random actions of the host: single, broadcast and group
 instructions, registered writes, resets, Clear, backups, Secondary IDs, changes of ID and baud rate, stuffed packets,

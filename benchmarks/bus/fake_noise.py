@@ -1,4 +1,4 @@
-"""Random bytes and mutated packets on the fake bus: nothing may raise or hang, and the next valid packet is answered.
+"""Random bytes and mutated packets on the fake bus: it must not raise or hang, and must answer the next valid packet.
 
     python benchmarks/bus/fake_noise.py [--json] [--packets N] [--seed N]
 
@@ -38,7 +38,7 @@ class Still:
 
 
 class NoiseRun:
-    """A bus of two servos that receives noise; `asked` counts the pings sent in between, `answered` those answered."""
+    """A bus of two servos that receives noise. `asked`, `answered`: numbers of pings sent in between and of replies."""
 
     def __init__(self, seed: int) -> None:
         self.random = Random(seed)

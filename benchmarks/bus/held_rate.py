@@ -1,19 +1,19 @@
-"""Whether an arm of four joints, two of which have a second servo, sustains 400 Hz at 1 Mbaud.
+"""Test whether an arm of four joints, two of which have a second servo, sustains 400 Hz at 1 Mbaud.
 
     python benchmarks/bus/held_rate.py [--seconds 20] [--rounds 3] [--fast | --plain] [--pty] [--json]
 
 The arm is held at rest with torque on while the program does the same work as during an experiment: deadlines,
 read-backs, exchanges with slow reads and status reads, checks, and recording. The servos run in another process, which
 takes as long for each byte as the wire would. Both processes ask for real-time scheduling, each on its own core. They
-are connected by a socket, which wakes the reader at once. With --pty it is a terminal, as with `hil fake --pty`, whose
-bytes the kernel forwards in a thread of ordinary priority: other programs then delay them by milliseconds. Virtual
-machines also stall. The load is printed. After each round, a loop with the same deadlines and real-time settings that
-only waits shows how many deadlines the computer misses on its own. With --pty, a second one writes the bytes of an
-exchange and reads the reply from a responder in C, which takes as long for each byte as the wire would; it has no
-driver, checks, slow reads or read-backs.
+are connected by a socket, which wakes the reader at once. With --pty, they are connected by a terminal, as with
+`hil fake --pty`; the kernel forwards the bytes of a terminal in a thread of ordinary priority, so other programs may
+delay them by milliseconds. As a virtual machine may also stall, the computer's load is printed. After each round, a
+loop that has the same deadlines and real-time settings but only waits shows how many deadlines the computer misses on
+its own. With --pty, a second such loop writes the bytes of an exchange and reads the reply from a responder in C, which
+takes as long for each byte as the wire would; this loop has no driver, checks, slow reads or read-backs.
 
-missed: number of missed deadlines. slow: number of those caused by the computer or the pty, because the preceding
-exchange took over 1 ms longer than the wire needs. lost: number of samples in which a reply is missing.
+missed: number of missed deadlines. slow: number of missed deadlines for which the computer or the pty is to blame,
+because the preceding exchange took over 1 ms longer than the wire needs. lost: number of samples with missing replies.
 late: 99 % quantile and maximum of the time from a deadline to the write [ms]. took: median, 99 % quantile and maximum
 of the round trip [ms]. work: median time from a reply to the next wait, which is spent on recording and checks [us].
 """
@@ -55,7 +55,7 @@ RATE = 400.0
 BYTE_NS = 10_000
 SLOW_S = 1e-3
 SMALL_A = 0.02
-"""Planned peak current for the checks; the arm is at rest all the time."""
+"""Planned peak current that is passed to the checks, although the arm is at rest all the time."""
 
 
 def six_servos(folder: Path, baud: str = "1_000_000") -> Path:
@@ -148,7 +148,7 @@ def bare(seconds: float, device: str | None, *, fast: bool) -> int:
 
 
 def play(bus: ServoBus, guard: Guard, model: ChainWatch, recorder: Recorder, samples: int, worked: list[float]) -> None:
-    """Do the work of `hil.experiment.stream` for samples at rest; append the time of each sample's work to `worked`."""
+    """Do the work of `hil.experiment.stream` at rest; append the time spent on each sample's work to `worked`."""
     pace, goal, sent_at = Pace(bus, RATE, guard), [0.0] * len(bus.joints), None
     for _ in range(samples):
         deadline, now, late = pace.wait()

@@ -1,4 +1,4 @@
-"""Random calls of dynamixel_sdk on a fake arm; every answer is compared with the rules of the manual.
+"""Random calls to a fake arm with dynamixel_sdk; every answer is compared with the rules of the manual.
 
     python -m benchmarks.bus.random_calls --calls 3000 --seed 1
 
@@ -74,8 +74,8 @@ class Client:
         self.late = 0
 
     def ask(self, call: Callable[[], Any]) -> Any:
-        """Make a call; repeat it if no answer arrives in time, because this computer, which runs both ends of the
-        terminal, may be busy.
+        """Make a call, and repeat it if no answer arrives in time. Answers may be late because this computer runs both
+        ends of the terminal and may be busy.
         """
         for _ in range(TRIES):
             answer = call()
@@ -221,7 +221,7 @@ class Client:
             self.look(servo_id, rules.rows[waiting[0]])
 
     def _act(self, servo_id: int) -> tuple[int, int]:
-        """Send Action to one servo and read its answer, which the SDK's own call does not; an unread answer would
+        """Send Action to one servo and read its answer. The SDK's own call leaves the answer unread, and it would then
         disturb the next call.
         """
         packet = [0] * 10
@@ -244,7 +244,7 @@ class Client:
         right = (result, error) == (0, 0) and len(data) == size
         defined = {byte for other in self.servos[servo_id].rows.values() for byte in other.span}
         if error == ACCESS and not set(range(row.address, row.address + size)) <= defined:
-            return  # the manual refuses undefined addresses; servos are known to read them as 0
+            return  # according to the manual, undefined addresses are refused; servos are known to read them as 0
         for other in self.servos[servo_id].rows.values():
             at = other.address - row.address
             wanted = self.servos[servo_id].expected(other.address)
@@ -293,7 +293,7 @@ class Client:
             self._told(servo_id, own, data, (result, 0), "sync_read_data")
 
     def _grouped(self, group: Any, servo_id: int, row: Row) -> bytes:
-        """A register's value as the SDK stores it from a grouped read; None if the answer had no data."""
+        """A register's value as the SDK stores it from a grouped read; b"" if the answer had no data."""
         try:
             return int(group.getData(servo_id, row.address, row.size)).to_bytes(row.size, "little")
         except IndexError:
@@ -338,7 +338,7 @@ class Client:
         self.compare(f"indirect_read {servo_id} {row.address}, expected {held}", (got, *answer), got == held)
         may = self.servos[servo_id].write(row.address, value)
         answer = self.ask(lambda: self.handler.writeTxRx(self.port, servo_id, place, row.size, list(value)))
-        if row.size > 1 and answer[1]:  # of several bytes that are refused, the manual does not say which are kept
+        if row.size > 1 and answer[1]:  # refused: the manual does not say which of the bytes have been stored
             self.servos[servo_id].held.pop(row.address, None)
         self.compare(f"indirect_write {servo_id} {row.address} {list(value)}, expected {may}", answer, answer[1] in may)
         self.look(servo_id, row)

@@ -1,8 +1,8 @@
 """What a servo answers and stores according to ROBOTIS' manual alone: the oracle of `random_calls` and `conversations`.
 
-Written from the e-Manual's control tables and protocol page, without the fake's code, so that the manual settles any
-difference between the two. Where the manual is silent or vague, the oracle allows several answers, or treats the
-value of a register as unknown until it is read again.
+The oracle was written from the e-Manual's control tables and protocol page, without use of the fake's code, so that any
+difference between oracle and fake has to be settled by the manual. Where the manual is silent or vague, the oracle
+allows several answers, or treats the value of a register as unknown until it is read again.
 """
 
 from collections.abc import Iterable, Mapping
@@ -166,7 +166,7 @@ FORGOTTEN_WITH_MODE = (*GAINS, 100, 102, 104, 108, 112, 116)
 class Rules:
     """The register values of one servo according to its manual, derived from the instructions that it received.
 
-    table: its control table. values: what its registers hold now, by address.
+    table: the servo's control table. values: the present contents of its registers, by address.
     """
 
     def __init__(self, table: Iterable[Row], values: Mapping[int, int]) -> None:
@@ -206,7 +206,7 @@ class Rules:
         """Change the mode, which resets gains to those of the mode, the profile to 0, and goals to their limits."""
         before = self.held.get(OPERATING_MODE)
         self._forget(FORGOTTEN_WITH_MODE)
-        if before is not None and before != mode:  # the manual does not say whether the same mode counts
+        if before is not None and before != mode:  # the manual does not say what writing the same mode does
             self.held |= {108: 0, 112: 0}
             self.held |= {goal: self.held[limit] for goal, limit in ((100, 36), (102, 38)) if limit in self.held}
 
@@ -251,7 +251,7 @@ class Rules:
         self.held = before
         if errors == {FINE}:
             self.waiting = address, data
-        elif FINE in errors:  # the caller knows which
+        elif FINE in errors:  # only the caller knows whether the servo accepted the write
             self._forget([address])
         return errors
 
@@ -260,7 +260,8 @@ class Rules:
         if self.waiting is None:
             return {INSTRUCTION}
         (address, data), self.waiting = self.waiting, None
-        return self.write(address, data) | {FINE, INSTRUCTION}  # the latter if it was repeated after a late answer
+        # Instruction error: if Action was repeated after a late answer, nothing is registered any more.
+        return self.write(address, data) | {FINE, INSTRUCTION}
 
     def reboot(self) -> None:
         """Reset RAM to its power-up values; EEPROM is kept."""
@@ -271,7 +272,7 @@ class Rules:
                 if row.initial is not None:
                     self.held[row.address] = row.initial
         if self.held.get(OPERATING_MODE) != POSITION_MODE:
-            self._forget(GAINS)  # the table's are those of the factory's mode
+            self._forget(GAINS)  # the gains in the table are those of the factory mode
 
     def factory_reset(self, kept: Iterable[int]) -> None:
         """Reset EEPROM to its factory values except for the registers `kept`; the servo reboots."""

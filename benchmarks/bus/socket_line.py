@@ -1,7 +1,8 @@
 """A fake arm in another process, connected by a Unix socket instead of a terminal.
 
-The kernel forwards the bytes of a terminal in a thread of ordinary priority, so that on a machine with other programs
-they are often milliseconds late. Bytes in a socket are there at once, and the reader is woken with its own priority.
+The kernel forwards the bytes of a terminal in a thread of ordinary priority; on a machine that runs other programs,
+they are therefore often milliseconds late. Bytes in a socket are available at once, and the reader is woken with its
+own priority.
 """
 
 import fcntl
@@ -44,7 +45,7 @@ class SocketServer(PtyServer):
 
 
 class Line:
-    """What a port needs of a pyserial port, for a socket."""
+    """The part of pyserial's port interface that `SocketPort` needs, implemented by a socket."""
 
     timeout = 0.0
     baudrate = BAUD
@@ -59,7 +60,7 @@ class Line:
 
 
 class SocketPort(DescriptorPort):
-    """A socket, used exactly as a local device is."""
+    """A port that uses a socket in exactly the same way as a local device."""
 
     def set_baud(self, baud: int) -> None:
         self.baud = baud
@@ -71,8 +72,8 @@ class SocketPort(DescriptorPort):
 
 @contextmanager
 def socket_line(config: Path) -> Iterator[None]:
-    """Serve this arm in another process, with real-time priority if permitted. Ports that are opened meanwhile lead
-    there, whatever they are called.
+    """Serve this arm in another process, with real-time priority if permitted. In the `with` block, every port that a
+    ServoBus opens is connected to this arm, whatever its name.
     """
     ours, theirs = socket.socketpair()
     ours.setblocking(False)

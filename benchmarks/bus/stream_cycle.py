@@ -44,7 +44,7 @@ from hil.setup.realtime import real_time
 
 CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link.toml"
 REST_S = 1.5
-"""Time for which the arm may come to rest after each round of the stream [s]."""
+"""Time given to the arm to come to rest after each round of the stream [s]."""
 
 
 class Sleeping(WallClock):
@@ -55,7 +55,7 @@ class Sleeping(WallClock):
 
 
 class Round(NamedTuple):
-    """One client's round: CPU time per sample [us], share of deadlines missed, samples with a missing reply."""
+    """One round of one client: CPU time per sample [us], share of missed deadlines, samples with missing replies."""
 
     cpu_us: float
     missed: float
@@ -83,7 +83,7 @@ def fake_pty(config: Path, *, real_time: bool = False) -> Iterator[str]:
 
 @contextmanager
 def stream(device: str, config: Config) -> Iterator[Player]:
-    """Play the beginning of an experiment: torque on, then the first samples of the ramp and the first period."""
+    """Play the beginning of an experiment: switch torque on, then play the first samples of the ramp."""
     config = config.model_copy(update={"port": config.port.model_copy(update={"url": device})})
     plan = make_plan(config)
     numbers = count()

@@ -154,7 +154,7 @@ def _servo_mass(model: ServoModel) -> float:
 
 
 def _holding_torque(links: list[dict[str, float]], models: list[ServoModel]) -> float:
-    """Torque at joint 1 with the arm stretched out horizontally [N m]."""
+    """Gravity torque at joint 1 with the arm stretched out horizontally [N m]."""
     held = links[0]["mass"] * links[0]["centre"]
     if len(links) == 2:
         reach = links[0]["length"]

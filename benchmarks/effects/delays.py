@@ -2,8 +2,8 @@
 
     python benchmarks/effects/delays.py [--json] [--arms 10] [--first 0] [--law delay|lag|logged] [--longest 3]
 
-delay: each joint's torque comes late; lag: it passes a first-order filter; logged: the position of joint 2 is logged
-later than that of joint 1.
+delay: each joint's torque comes late; lag: each joint's torque passes a first-order filter; logged: the position of
+joint 2 is logged later than that of joint 1.
 
 Each arm has links, friction and a multisine torque drawn at random. Its positions come from this script's own
 equations of motion in absolute angles, integrated with steps of 20 us. Noise is added, and some recordings are rounded
@@ -46,7 +46,7 @@ torque = ["tau1", "tau2"]
 @dataclass(frozen=True)
 class Arm:
     """links: masses of links 1 and 2 and of the elbow [kg], length 1, centres of mass [m], inertias and armatures
-    [kg m^2], gravity [m/s^2]. friction (2, 6): viscous, Coulomb, width, Stribeck rise, its velocity, share of load.
+    [kg m^2], gravity [m/s^2]. friction (2, 6): viscous, Coulomb, width, Stribeck rise and velocity, load dependence.
     """
 
     links: Array
@@ -124,7 +124,7 @@ def _rates(state: Array, torque: Array, links: Array, friction: Array) -> Array:
 
 @compiled
 def _motion(command: Array, interval: float, late: Array, links: Array, friction: Array) -> Array:
-    """Positions at the times of the commands (2, samples) [rad]. The arm hangs at first; each command is held.
+    """Positions at the times of the commands (2, samples) [rad]. The arm initially hangs; each command is held.
 
     late (3, 2): delay and lag of each joint's torque, and delay with which its position is logged [s].
     """

@@ -1,4 +1,4 @@
-"""Effect of presliding friction on models with and without it.
+"""Effect of the arm's presliding friction on the accuracy of models that include it and of models that do not.
 
     python benchmarks/effects/presliding.py [--json] [--seeds N] [--stiffness 1000 200 50 15 5] [--law slip]
 

@@ -1,4 +1,4 @@
-"""`hil diff` on pairs of runs of one fake arm: changes found, and false alarms.
+"""`hil diff` on pairs of runs of one fake arm: how many changes it finds, and how many false alarms it raises.
 
     python -m benchmarks.effects.wear --runs 6
 
@@ -68,8 +68,8 @@ def main() -> None:
 
 
 def identify_all(config: Config, runs: int, other_motion: bool, folder: Path) -> Iterator[Identified]:
-    """Identify the unchanged arm `runs` times, and every changed one twice. config: describes a [fake] arm of two
-    joints.
+    """Identify the unchanged arm `runs` times, and every changed arm twice. config: configuration of a fake arm with
+    two joints.
     """
     seed = 0
     wanted = [""] * runs + [f"{term}_{joint}" for term in TERMS for joint in (1, 2) for _ in range(2)]
@@ -94,7 +94,7 @@ def _identify(config: Config, changed: str, seed: int, other_motion: bool, folde
 
 
 def arm_after(config: Config, changed: str, seed: int, other_motion: bool, folder: Path) -> Path:
-    """Write the file of the arm with one term changed. Returns its path."""
+    """Write the arm's file with one term changed, and return the path of that file."""
     lines = config.path.read_text(encoding="utf-8").splitlines()
     term, _, joint = changed.rpartition("_")
     drive, table = 0, ""

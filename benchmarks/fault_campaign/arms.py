@@ -1,4 +1,4 @@
-"""Bundled configurations adapted for a campaign: other rates, short periods, and a fake arm if there is none."""
+"""Bundled configurations adapted for a campaign: other rates, short periods, and a fake arm if they have none."""
 
 import json
 import tomllib
@@ -44,7 +44,7 @@ def settings() -> list[Setting]:
 
 
 def make_document(setting: Setting, period: float = PERIOD_S) -> dict[str, Any]:
-    """The configuration as a document, at this rate, with multisines of `period` [s] that soon count as settled.
+    """The configuration as a document, with this rate and with multisines of `period` [s] that soon count as settled.
 
     Only the experiment is shortened; limits, torques, models and safety settings are unchanged.
     """

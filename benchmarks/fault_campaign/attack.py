@@ -157,7 +157,7 @@ def request_among(packets: Iterable[Packet]) -> Request | None:
 
 
 def goals_in(packet: Packet) -> dict[int, tuple[int, int]]:
-    """(address, goal) by servo ID for a Sync Write of two-byte goals; empty for any other packet."""
+    """Address and goal, by servo ID, in a Sync Write of two-byte goals; empty for any other packet."""
     body = packet.body
     if packet.instruction != 0x83 or len(body) < 7 or body[2:4] != b"\x02\x00" or body[0] not in (100, 102):
         return {}
@@ -175,7 +175,7 @@ def without_goal(data: bytes, servo_id: int) -> bytes:
 
 
 def blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
-    """(error byte, register block) by servo ID for the complete answers to `request` in these bytes."""
+    """Error byte and register block, by servo ID, of the complete answers to `request` in these bytes."""
     if request.fast:
         return _fast_blocks_in(data, request)
     found: dict[int, tuple[int, bytes]] = {}

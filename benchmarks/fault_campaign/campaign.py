@@ -54,13 +54,15 @@ FREE = frozenset({"Goal Position", "Registered Instruction"})
 """Registers that a servo writes itself, independently of any program."""
 
 _LIMITS_LEFT = frozenset({Kind.KILLED, Kind.LOWERED_LIMIT})
-"""After these two faults together, the next start finds the limit set by the other program, and the start after that
-finds the limit that the killed run left.
+"""If these two faults occur together, the next start finds the limit set by the other program, and the start after that
+finds the limit that the killed run left behind.
 """
 
 _PACKAGE = "benchmarks.fault_campaign"
 _ARMS = (1, 12)
-"""Numbers of arms for which stops are simulated; the second is used if the overshoot exceeds the first prediction."""
+"""Numbers of arms for which stopping is simulated. The second number is used if the overshoot exceeds the prediction
+for the first.
+"""
 
 _CHECKED_CYCLES = 8
 """Cycles per mode in the next start's `hil check`, which only has to restore settings here."""
@@ -74,8 +76,8 @@ class DoesNotRun(Exception):
 class Outcome:
     """The outcome of one injection.
 
-    not_restored: registers that still differ from their earlier values after the next start. unreadable: the run left
-    neither an expected message nor a readable recording.
+    not_restored: registers that differ from their earlier values even after the next start. unreadable: whether the run
+    left neither an expected message nor a readable recording.
     """
 
     setting: Setting
@@ -103,7 +105,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Ready:
-    """A configuration at a rate, with its undisturbed run."""
+    """A configuration at one rate, and its run without faults."""
 
     setting: Setting
     path: Path
@@ -150,7 +152,7 @@ def inject_drawn(ready: Ready, drawn: Drawn, seed: int) -> Outcome:
 
 
 def play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str, ...]]:
-    """Run `hil record` once; return its story, whether its recording is readable, and which registers it changed."""
+    """Run `hil record` once; return its Story, whether the recording is readable, and which registers have changed."""
     witnesses: list[Witness] = []
     before: dict[int, dict[str, int]] = {}
 

@@ -15,7 +15,7 @@ TOGETHER_S = 0.3
 """In half of the pairs, the two faults are at most this far apart [s]."""
 
 OFTEN = 0.25
-"""Additional share of the faults that are placed in a phase that is short but needs many tests."""
+"""Additional share of faults that are drawn within a short phase that needs many tests."""
 
 SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
@@ -84,7 +84,7 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.STUCK_BIT: _FORGED | {LIMIT, POSE},
     Kind.CONSTANT: _FORGED | {LIMIT, POSE},
     Kind.COLLISION: _BYTES | {MIXED},
-    Kind.DEAF: _LOST_GOALS | {SILENCE},  # with a chance below 1 it misses goals and answers other requests
+    Kind.DEAF: _LOST_GOALS | {SILENCE},  # if the chance is below 1, the servo may miss goals but answer other requests
     Kind.DEAF_TO_GOALS: _LOST_GOALS,
     Kind.TWICE_TOLD: _REPEATED,
     Kind.TORQUE_TAKEN: _LOST_GOALS,
@@ -164,7 +164,7 @@ _OF_FIELD = {
     "velocity": _READINGS | {LIMIT},
     "current": frozenset({TORQUE, VOLTAGE}),
 }
-"""Causes that a message may name if only one reading is forged: a wrong angle, for instance, is not lost torque."""
+"""Causes that a message may name if only one reading is forged; e.g. a wrong angle must not be called lost torque."""
 
 
 _INSTRUCTIONS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTRUCTION})
@@ -243,7 +243,7 @@ def true_beside(drawn: Drawn) -> frozenset[str]:
 def draw(seed: object, until: float, ids: Sequence[int], often_since: float | None = None) -> Drawn:
     """Draw one or two faults for a run that lasts `until` [s] undisturbed; the same seed gives the same faults.
 
-    often_since: beginning of a phase in which a quarter of the faults occur, although it is short [s].
+    often_since: beginning of a short final phase [s], in which an additional quarter of the faults is placed.
     """
     random = Random(f"drawn {seed}")
     first = random.uniform(0.0, until)
@@ -275,7 +275,7 @@ def _chance(random: Random) -> float:
 
 def _attack(kind: Kind, at: float, ids: Sequence[int], random: Random) -> Attack:
     servo = random.choice((None, *ids))
-    # Forged values stay forged: an intermittent forgery would be a new fault at every sample.
+    # Values are forged without interruption: an intermittent forgery would be a new fault at every sample.
     chance = 1.0 if kind in FORGED | ON_MOTORS | {Kind.ECHO, Kind.ONE_BEHIND, Kind.REORDERED} else _chance(random)
     fields = ("position", "velocity", "current")
     field = random.choice(fields if kind in _OF_ONE_FIELD else ("state", *fields))

@@ -8,7 +8,7 @@ from random import Random
 from benchmarks.fault_campaign.attack import Attack, Kind, Request, blocks_in, field_of, forged, with_field
 
 _IDS = 3
-"""Largest wrong ID. Wrong IDs begin at 1, so they include the arm's own IDs and one that is not on the bus."""
+"""Largest wrong ID. Wrong IDs begin at 1, so they include the IDs of the arm and one that is not on the bus."""
 
 
 class Forger:

@@ -51,8 +51,8 @@ the bus is used.
 """
 
 SHORTEST_WATCHDOG_S = 0.04
-"""Shortest practicable timeout of the Bus Watchdog [s]. It counts in steps of 20 ms, and with one step, it would trip
-even during a stall of a busy computer after which the arm can still be lowered.
+"""Shortest practicable timeout of the Bus Watchdog [s], which counts in steps of 20 ms. With a timeout of one step, it
+would trip even during short stalls of a busy computer, after which the arm can still be lowered.
 """
 
 OBEYED = 0.1
@@ -65,13 +65,12 @@ DRIVES_MS = 15
 """Longest time for which a goal in the direction of visible motion may exceed all goals of the undisturbed run [ms]."""
 
 DRIVES_SHARE, DRIVES_TICKS, DRIVES_S = 1.2, 5, 0.01
-"""Ratio to the largest goal of the undisturbed run above which a goal is too large; smallest change of position that
-counts as visible motion [ticks], and the time within which it must occur [s].
+"""Largest permitted ratio of a goal to the largest goal of the undisturbed run; largest change of position that does
+not yet count as visible motion [ticks]; time within which visible motion must occur [s].
 """
 
 STIRS_RAD = 0.05
-"""Largest motion between two readings before torque is on that a program may attribute to a healthy arm [rad].
-"""
+"""Largest change between two readings before torque is on that a program may take for motion of a healthy arm [rad]."""
 
 TO_BE_SEEN = (
     "is not where the program was told",
@@ -105,12 +104,12 @@ class Story:
 class Verdict:
     """The judgement of one run.
 
-    owed: why the current had to end, "" if there was no reason. late_ms: how long current flowed after that. beyond:
-    overshoot of each joint beyond its limit (joints,) [rad]. named: whether the output names the cause; None if nothing
-    stopped the run. misleading: the output names only wrong causes. unseen: the current ended late, but a healthy arm
-    might have sent the same replies (`fault_campaign.twin`) until shortly before, so the run is not unsafe. drives_ms:
-    how long the program drove a joint harder than planned in the direction in which the received positions were moving,
-    which a program that brakes must not do.
+    owed: why the current had to end; "" if there was no reason. late_ms: how long current flowed after it had to end.
+    beyond: overshoot of each joint beyond its limit (joints,) [rad]. named: whether the output names the cause; None if
+    nothing stopped the run. misleading: whether the output names only wrong causes. unseen: whether the current ended
+    late, but a healthy arm might have sent the same replies (`fault_campaign.twin`) until shortly before, in which case
+    the run is not unsafe. drives_ms: how long the program drove a joint harder than planned in the direction in which
+    the received positions were moving; a program that brakes must not do this.
     """
 
     owed: str
@@ -124,7 +123,7 @@ class Verdict:
 
 
 def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Verdict:
-    """Judge the run of `story`, into which `drawn` was injected."""
+    """Judge the run that `story` describes, into which the faults `drawn` were injected."""
     told = Told(config, story.traffic, drawn.start)
     reasons = reasons_of(config, drawn, story, undisturbed, told)
     owed, since = min(reasons, key=lambda reason: reason[1], default=("", np.inf))
@@ -204,8 +203,8 @@ def was_built_so(config: Config, drawn: Drawn, story: Story) -> bool:
     them, while their encoders showed the same angle.
 
     Until the swap, both servos gave the same readings. Afterwards, the arm is a healthy arm whose servos are wired the
-    other way round, so its replies cannot reveal the fault. This needs no simulation; for an upright arm, a simulation
-    could not even show it, because in open loop the smallest difference makes such an arm fall.
+    other way round, so its replies cannot reveal the fault. No simulation is needed to conclude this. For an upright
+    arm, a simulation would not even help, because in open loop the smallest difference makes such an arm fall.
     """
     if drawn.kinds != (Kind.IDS_SWAPPED,) or not may_be_wired_otherwise(config):
         return False
@@ -232,16 +231,18 @@ def addressed(config: Config, record: NDArray[Any], joint: int) -> NDArray[Any]:
 
 
 def acts_at(attack: Attack, attacks: Sequence[Attack]) -> float:
-    """When an attack acts [s]: if the program is suspended at its start, the attack acts once the program resumes."""
+    """Time at which an attack takes effect [s]: at its start or, if the program is suspended, once it resumes."""
     stops = [each for each in attacks if each.kind in (Kind.STALL, Kind.SUSPENDED) and each.start <= attack.start]
     return max([attack.start, *(each.start + each.amount for each in stops)])
 
 
 def since_again(driven: NDArray[np.float64], since: float, again: list[float]) -> float:
-    """Time at which the current had to end [s] if another program switched torque on again, at the times `again`.
+    """Time from which the time limit for ending the current counts [s]: `since`, or a later time at which another
+    program switched torque on again.
 
-    driven: times at which current flowed [s]. The time limit restarts at such a time if the current ended in time after
-    `since`, was off for `LASTING_MS` (longer than goals take to pass through zero), and then flows again.
+    driven: times at which current flowed [s]. again: times at which another program switched torque on. The time limit
+    restarts at such a time if the current had ended in time after `since`, had been off for `LASTING_MS` (longer than
+    goals take to pass through zero), and then flowed again.
     """
     for when in sorted(again):
         begins = when - 1e-3 * UNSURE_MS
@@ -260,10 +261,10 @@ def _flowed_ms(driven: NDArray[np.float64], since: float) -> float:
 
 
 def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
-    """Whether the message names a true cause among at most three causes, and whether it names only wrong ones."""
+    """Whether at least a third of the causes that the message names are true, and whether it names only wrong ones."""
     offered = causes_in(text)
     if set(drawn.kinds) <= HARMLESS:
-        return False, True  # regardless of the message: the run should not have stopped
+        return False, True  # whatever the message says, the run should not have been stopped
     right = causes_of(drawn)
     if not right:
         return True, False  # none of the faults had to stop the run, so the message is not judged
@@ -281,7 +282,7 @@ Reason = tuple[str, float]
 
 
 def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, told: "Told") -> list[Reason]:
-    """Reasons why the current had to end, each with its time [s]."""
+    """Reasons why the current had to end, each with the time from which it applied [s]."""
     record = story.record
     time = record["time"][:, 0]
     interval = 1.0 / config.experiment.rate
@@ -331,8 +332,10 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
 
 
 def _not_before(what: str, when: float, helpless: Sequence[tuple[float, float]]) -> float:
-    """Time at which the current had to end [s] after a failure at `when`; if a servo was silent, not before anything
-    could end it.
+    """Time from which a failure at `when` obliged the program to end the current [s].
+
+    If the failure is a silent servo, this is not before the end of the times in which nothing could end the current
+    (`helpless`).
     """
     until = [end for since, end in helpless if since <= when < end]
     return max([when, *until]) if what.endswith("was not heard") else when
@@ -341,8 +344,8 @@ def _not_before(what: str, when: float, helpless: Sequence[tuple[float, float]])
 def stopped_unwatched(drawn: Drawn) -> list[tuple[float, float]]:
     """Return when the program was suspended just after another program had disarmed the watchdogs: (start, end) [s].
 
-    Neither a suspended program nor a disarmed watchdog can end the current. If the program is suspended before it must
-    have noticed the disarmed watchdogs, nothing can end the current until the program runs again.
+    Neither a suspended program nor a disarmed watchdog can end the current. If the program is suspended before it can
+    be expected to have noticed the disarmed watchdogs, nothing can end the current until the program runs again.
     """
     disarmed = [each.start for each in drawn.attacks if each.kind in (Kind.WATCHDOG_OFF, Kind.WATCHDOG_LONG)]
     return [
@@ -370,7 +373,7 @@ def fed_by_another(drawn: Drawn, ended: float) -> tuple[float, float]:
         and each.size < SHORTEST_WATCHDOG_S
         and each.at <= since < each.end
     ]
-    # What was heard last may be a cycle older than the kill.
+    # The last reply before the kill may be up to one cycle older than the kill.
     return since - 1e-3 * UNSURE_MS, max(fed, default=-np.inf)
 
 
@@ -389,7 +392,10 @@ def overruled_ms(config: Config, story: Story, told: "Told") -> float:
 
 
 def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int, gap_ms: int) -> Reason | None:
-    """Time [s] at which a failure began that lasted at least `hold_ms`, including interruptions of up to `gap_ms`."""
+    """First failure that lasted at least `hold_ms`, with the time at which it began [s]; None if there is none.
+
+    Interruptions of up to `gap_ms` do not end a failure.
+    """
     at = np.flatnonzero(wrong)
     if not at.size:
         return None
@@ -513,7 +519,10 @@ def _begins(record: NDArray[Any]) -> int:
 def _astray(
     config: Config, drawn: Drawn, own: NDArray[Any], undisturbed: NDArray[Any], later: int
 ) -> NDArray[np.bool_]:
-    """For each millisecond, whether a joint is far from its undisturbed motion; `own` begins after `later` ms."""
+    """For each millisecond, whether a joint is far from its undisturbed motion.
+
+    later: delay of the motion, due to a longer set-up [ms]; `own` is the joint's record without its first `later` ms.
+    """
     count = min(own.size, undisturbed.size)
     wrong = np.zeros(later + own.size, bool)
     if set(drawn.kinds) & SHIFTED:
@@ -530,7 +539,8 @@ def _astray(
 def _same_plan(own: NDArray[Any], undisturbed: NDArray[Any]) -> int:
     """Number of milliseconds for which a servo was given the goals of the undisturbed run.
 
-    After that, the plan may differ: a disturbed period does not repeat the previous one, so another one is added.
+    After that, the plan may differ: if a period does not repeat the previous one because it was disturbed, the program
+    adds another period.
     """
     goal: Numbers = undisturbed["goal"]
     mine: Numbers = own["goal"]

@@ -189,7 +189,7 @@ class Middle(FakeSerial):
         self._raw.clear()
 
     def _changed(self, packet: bytes, now: float) -> Iterator[tuple[float, bytes]]:
-        """The (delay [s], bytes) pairs that a reply turns into."""
+        """Yield what a reply is turned into: pairs of a delay [s] and bytes."""
         servo_id = packet[4] if len(packet) > 4 else None
         packet = self._forger.keep_and_forge(packet, self._request, now, self._forging(now))
         wait, copies, gap = 0.0, 1, None

@@ -64,7 +64,7 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
         case Kind.IDS_SWAPPED if len(port.bus._servos) == 2:
             first, second = port.bus._servos
             ids = first.id, second.id
-            for servo in (first, second):  # with torque on, a servo refuses another ID
+            for servo in (first, second):  # with torque on, a servo would refuse the new ID
                 servo.write(64, b"\x00")
             return [_change(first, "ID", ids[1]), _change(second, "ID", ids[0])]
         case _:
@@ -104,12 +104,12 @@ def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
         case Kind.STRANGE_GOAL:
             _write_goal(attack, servo)
         case Kind.MODE_TAKEN if servo.torque_enabled:
-            # It is also the mode from before the run, so nothing has to be undone.
+            # Position mode is also the mode before the run, so nothing has to be undone.
             for address, value in ((64, 0), (11, _POSITION_MODE), (64, 1)):
                 servo.write(address, bytes((value,)))
         case Kind.TURNED_ROUND:
             undo = _change(servo, "Drive Mode", servo.value("Drive Mode") ^ 1)
-            servo.reboot(now, _SHORT_BOOT_S)  # with torque on it could not be written
+            servo.reboot(now, _SHORT_BOOT_S)  # with torque on, Drive Mode could not be written
             return undo
         case Kind.FACTORY_RESET:
             return _reset(servo, now)

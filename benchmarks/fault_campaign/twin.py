@@ -35,8 +35,8 @@ LAGS_S = np.linspace(0.0, LAG_S, 7)[1:]
 """Velocity lags to try [s]."""
 
 LAGGING_S = 0.2
-"""Length of the intervals [s] in each of which a lag must reduce the RMS difference of velocities to an ordinary value:
-a lag explains the differences at all times or not at all.
+"""Length of the intervals [s] for which the velocity differences are judged. A lag counts as an explanation only if it
+reduces their RMS to an ordinary value in every interval.
 """
 
 _TICKS_PER_RAD = 4096 / (2 * np.pi)
@@ -47,9 +47,9 @@ _UNDESCRIBED, _DESCRIBED = np.log(10.0), np.log(2.5)
 _FRICTION, _CENTRE, _TORQUE = np.log(5.0), np.log(2.0), np.log(1.25)
 _TILT_RAD = 0.2
 _EVALUATIONS = 6
-_STEP = 0.01  # of the finite differences
+_STEP = 0.01  # step of the finite differences
 _COARSE_S = 0.005
-"""Interval of the replies and commands that the search uses [s]; the arm found is then compared with all of them."""
+"""Interval between the replies and commands used in the search [s]; the arm found is then compared with all of them."""
 
 _COARSE_STEP_S = 2.5e-3
 """Longest step of the simulation in the search [s]."""
@@ -196,7 +196,7 @@ def _stick(arm: Arm) -> Arm:
 
 
 def _differences(arm: Arm, parameters: Array, told: Heard) -> Array:
-    """Differences of angles, then of velocities, divided by ordinary differences (2 n joints,)."""
+    """Differences of all angles, then of all velocities, each divided by its ordinary size (2 n joints,)."""
     angle, velocity = _played(arm, parameters, told)
     return np.concatenate(((angle - told.angle).ravel() / SAME_RAD, (velocity - told.velocity).ravel() / SAME_RAD_S))
 
@@ -252,7 +252,7 @@ def _altered(arm: Arm, parameters: Array) -> Arm:
             "coulomb": coulomb * drive.coulomb,
             "torque_constant": torque * drive.torque_constant,
         }
-        drives.append(drive.model_copy(update=changed))  # not validated, like links: files bound what a search may try
+        drives.append(drive.model_copy(update=changed))  # not validated: a search may exceed the bounds for files
     start = (arm.start[0] + float(parameters[-1]), *arm.start[1:])
     return arm.model_copy(update={"links": tuple(links), "drives": tuple(drives), "start": start})
 

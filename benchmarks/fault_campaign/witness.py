@@ -16,10 +16,10 @@ from hil.fakes.servo.servo import EmulatedServo
 STEP_S = 1e-3
 CURRENT_MODE, PWM_MODE = 0, 16
 GRIP_RAD_S = 0.1
-"""Velocity at which a hand that grips the arm brakes with most of its force [rad/s]."""
+"""Velocity of the arm at which a hand that grips it brakes with most of its force [rad/s]."""
 
 SLIPS_S = 0.05
-"""Time in which a joint slips on its shaft [s]."""
+"""Time that a joint takes to slip on its shaft [s]."""
 
 HALF = 0.5
 """Fraction of the torque constant that a motor loses when its magnet overheats."""
@@ -45,7 +45,7 @@ RECORD = np.dtype(
 
 
 class Witness:
-    """Wraps the plant and records every step. It changes only the disturbances requested by `disturb`."""
+    """Wraps the plant and records every step. Its only effects on the plant are those requested with `disturb`."""
 
     def __init__(self, bus: FakeBus) -> None:
         self._plant = bus.plant

@@ -1,11 +1,11 @@
-"""Number of healthy but unusual arms that are stopped although nothing is wrong with them.
+"""False alarms: how many healthy but unusual arms are stopped.
 
     python benchmarks/safety/healthy.py [--arms 60] [--first 0] [--show] [--json]
 
 Each arm is a bundled planar configuration at 100 or 400 Hz with ramps of only 0.3 s. Its masses, torque constants and
-friction differ from the description by up to a factor of 2.2, 1.5 and 2.5, and it has play, presliding, cogging and
-cables that no description mentions. Each is recorded twice: with and without `arm.link_lengths`. Limits are wide, so
-only a check that mistakes a healthy arm for a faulty one can stop the run.
+friction differ from the description by factors of up to 2.2, 1.5 and 2.5, respectively, and it may have play,
+presliding, cogging and cables that the description does not mention. Each arm is recorded twice: with and without
+`arm.link_lengths`. Limits are wide, so only a check that mistakes a healthy arm for a faulty one can stop the run.
 """
 
 import argparse
@@ -31,8 +31,8 @@ WIDE_RAD, WIDE_RAD_S = 3.1, 25.0
 RESTS_S = 5.0
 
 _SKIPPED = frozenset({"fake_inverted", "paper_two_link"})
-"""Arms that are not drawn: an inverted one, which only a controller designed for its exact description keeps upright,
-and the seed paper's, which moves by only a few degrees.
+"""Arms that are left out: an inverted arm, which only a controller designed for its exact description keeps upright,
+and the seed paper's arm, which moves by only a few degrees.
 """
 
 
@@ -93,7 +93,7 @@ def draw_again(seed: int, described: bool, setting: Setting, period: float) -> d
 
 
 def cause(said: str) -> str:
-    """Return a few words that identify the cause of a stop."""
+    """Return a few words that identify the reason why a run was stopped."""
     for words in ("position limit", "velocity limit", "any arm consistent", "does not repeat", "against its command"):
         if words in said:
             return words

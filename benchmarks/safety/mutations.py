@@ -3,9 +3,9 @@
     python benchmarks/safety/mutations.py [MODULE ...] [--json] [--every N]
 
 Each mutation changes one operator, comparison, number or boolean of a module (except in strings, annotations and zip's
-`strict`) and runs that module's tests in a child process. Mutations that no test detects survive. A mutation that makes
+`strict`); the module's tests then run in a child process. Mutations that no test detects survive. A mutation that makes
 a test hang counts as detected after `PATIENCE_S`. With NUMBA_DISABLE_JIT=1, compiled modules are tested as plain
-Python, which avoids the slowest step, compiling each mutation.
+Python; compiling every mutation would be the slowest step.
 """
 
 import argparse
@@ -98,7 +98,7 @@ EQUIVALENT = {
         "0.0  ->  1.0",
     ): "status_check: a clock's offset and its time, not used before the first reading",
 }
-"""Mutations whose effect these tests cannot detect, each given by part of its line, with the reason."""
+"""Mutations that have no effect the tests could detect: part of the line and the mutation, with the reason."""
 
 _SLOW_IMPORTS = (
     *("numpy", "scipy", "numba", "pydantic", "serial", "hil.estimator.identify"),

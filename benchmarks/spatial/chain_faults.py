@@ -103,11 +103,12 @@ LOOKED_AT_MS = 5
 class ChainOutcome:
     """The outcome of one injection.
 
-    owed: why the run had to end, "" if there was no reason. can_command: see above. lies: whether the arm was in its
-    rest pose when current ended. late_ms: how long current flowed after the failure. clearance: least distance while
-    motors drove the arm, minus that of the undisturbed run if the latter is negative [m]. beyond: largest overshoot of
-    a position limit while motors drove the arm [rad]. overruled_ms: longest time for which a motor carried a current
-    that was not commanded; at most `cut_ms` is allowed.
+    owed: why the run had to end; "" if there was no reason. can_command: whether the arm could still be commanded, as
+    described at the top of this file. lies: whether the arm was in its rest pose when current ended. late_ms: how long
+    current flowed after the failure. clearance: least distance while motors drove the arm [m], plus `SAME_M`; if links
+    overlapped in the undisturbed run, that overlap is allowed and added. beyond: largest overshoot of a position limit
+    while motors drove the arm [rad]. overruled_ms: longest time for which a motor carried a current that was not
+    commanded; at most `cut_ms` is allowed.
     """
 
     setting: Setting
@@ -221,7 +222,7 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
 
 
 def _owed(reasons: list[Reason], unreached: list[Reason], cut_ms: float, lower_ms: float) -> tuple[Reason, float]:
-    """The reason whose time limit expires first, and this limit [ms]."""
+    """The reason for ending the current whose time limit expires first, and this time limit [ms]."""
     ends = [(each, cut_ms if each in unreached else lower_ms) for each in reasons]
     return min(ends, key=lambda pair: pair[0][1] + 1e-3 * pair[1], default=(("", np.inf), cut_ms))
 
@@ -245,8 +246,8 @@ def longest_lowering(path: Path) -> float:
 def _leaves_command(drawn: Drawn, ended: float) -> bool:
     """Whether the arm could still be commanded: all faults are of kinds that permit this, and no force held it.
 
-    Only a force that still acts at the end of the run counts. False after a second request to stop, which asks for
-    torque to be cut at once.
+    Only a force that still acts at the end of the run counts. The result is False after a second request to stop, since
+    that asks for torque to be cut at once.
     """
     forced = any(
         each.kind in _BY_FORCE and each.start < ended < each.end and abs(each.amount) > WEAKER for each in drawn.attacks
@@ -274,7 +275,7 @@ def _undisturbed_clearance(setting: Setting) -> float:
 
 
 def _without_held(config: Config, position: Array, time: Array, drawn: Drawn | None) -> Array:
-    """The poses (joints, times) [rad], but with joints at their rest angles while something holds them by force."""
+    """The poses (joints, times) [rad], with joints set to their rest angles while something holds them by force."""
     free = position.copy()
     for attack in drawn.attacks if drawn else ():
         if attack.kind in _BY_FORCE and abs(attack.amount) > WEAKER:

@@ -227,7 +227,9 @@ def draw(folder: Path, seed: int, plain: bool = False) -> Path:
 
 
 def _weights(known: KnownChain, rest: Any, random: np.random.Generator) -> tuple[Any, Any]:
-    """Torques that hold the described arm in its rest pose, and their maxima over random poses (joints,) [N m]."""
+    """Torques that hold the described arm in its rest pose, and the largest holding torques in random poses (joints,)
+    [N m].
+    """
     n = len(rest)
     arm = ChainArms(known.base, known.base.of_all(known.described)[None], np.zeros((1, 6, n)))
     poses = random.uniform(-2.5, 2.5, (60, n))

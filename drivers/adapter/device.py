@@ -14,7 +14,7 @@ _USB_PORTS = ("ttyUSB*", "ttyACM*")
 
 
 def is_pseudo_terminal(device: str) -> bool:
-    """Whether the device is a pty; the program at its other end may also keep this end open."""
+    """Whether the device is a pty. The program that serves its other end may legitimately keep this end open, too."""
     return Path(device).resolve().parent == Path("/dev/pts")
 
 

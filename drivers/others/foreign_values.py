@@ -1,12 +1,12 @@
-"""Detection of servo values that this program cannot have written and that are read too often to be chance."""
+"""Detection of values that this program cannot have written but reads from a servo too often for an accident."""
 
 from collections import deque
 
 __all__ = ["ForeignValues"]
 
 ENOUGH, WITHIN_S = 3, 10.0
-"""Number of values not written by this program that, if read within this time [s], prove that something else writes to
-the servo or alters what is written.
+"""Number of foreign values, and the time [s] within which they must be read to prove that something else writes to the
+servo or alters what is written.
 """
 
 

@@ -47,7 +47,7 @@ class Heard:
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """Number of replies, since the last late reply, that contain one answer per servo but not the requested IDs."""
+        """Number of replies since the last late one that contain one answer per servo, but other IDs than requested."""
         self.strangers: float = 0
         """Number of received packets that another master sent or requested."""
 
@@ -70,7 +70,7 @@ class Heard:
             self._was_late(now)
 
     def _was_late(self, now: float) -> None:
-        """Record a late or repeated reply, which may also have mixed up the IDs of the replies before it."""
+        """Record a late or repeated reply. It may also be the reason for mixed-up IDs in the replies before it."""
         self.late_at, self.mixed_up = now, 0
 
     def instead(self, read: GroupRead, received: bytes, answers: Sequence[Answer], now: float, *, echoes: bool) -> None:
@@ -93,7 +93,7 @@ class Heard:
     def continued(self, before: bytes, received: bytes, now: float) -> None:
         """Examine bytes that may be the rest of a reply that was incomplete when its timeout expired.
 
-        before: the bytes that had been received by then.
+        before: the bytes received before the timeout.
         """
         whole = [packet for packet in _packets_within(before + received) if packet.is_status]
         if len(whole) > len(_packets_within(before)) + len(_packets_within(received)):
@@ -133,16 +133,16 @@ class Heard:
             self.strangers += sum(self._is_strange(packet) for packet in packets)
 
     def _is_strange(self, packet: Packet) -> bool:
-        """Whether this is another master's instruction or a reply to one.
+        """Whether this packet is another master's instruction or a reply to one.
 
-        An error reply without data may be meant for this program.
+        A status packet without data does not count, since it may be an error reply to this program.
         """
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
 
     def _is_anothers(self, servo_id: int, length: int) -> bool:
-        """Whether an apparently truncated instruction is another master's, not a damaged reply with this LEN."""
+        """Whether what looks like a truncated instruction comes from another master and is not a damaged reply."""
         lengths = {size + _BESIDE_DATA for _, size in self._expected}
         return servo_id in (*self._ids, BROADCAST_ID) and length <= _LONGEST_CUT_OFF and length not in lengths
 

@@ -19,8 +19,8 @@ GOALS, MODES, TORQUE = range(3)
 _OTHERS_S = {MODES: 0.025, TORQUE: 0.1}
 """Mean time between two read-backs of the modes, and between two of Torque Enable [s]. In between, goals are read back.
 
-The actual time is random. Otherwise, a program that overwrites goals periodically might always do so just when the
-modes are read.
+The actual time is random. If it were fixed, a program that overwrites goals periodically might always do so just when
+the modes are read.
 """
 
 _GOALS_PER_OTHER_IN_DOUBT = 4
@@ -33,8 +33,8 @@ _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Numbers of read-backs of a foreign value that prove another writer, and the time within which they must occur [s].
 
 Three read-backs of the same value are required for a goal that this program may have written in an earlier cycle, and
-for 0, which a servo itself may have set. By then, the status would have revealed lost writes, a tripped watchdog or a
-reboot; and if writes are lost only occasionally, the servo holds a different goal each time.
+for 0, which a servo itself may have set. Before the third one, the status would have revealed lost writes, a tripped
+watchdog or a reboot. If writes are lost only occasionally, the servo holds a different goal each time.
 """
 
 _UNSURE_S = 0.01
@@ -45,9 +45,9 @@ TRY_AGAIN_S = 0.005
 
 _AGAIN_SHARE = 0.5
 _SHORT_CYCLE_S = 0.005
-"""In cycles of up to `_SHORT_CYCLE_S` [s], a lost read-back is repeated at once, which may delay the next cycle by the
-fraction `_AGAIN_SHARE` of a cycle. In longer cycles, read-backs are rarely destroyed, and a delay would leave joints
-unobserved.
+"""In cycles of up to `_SHORT_CYCLE_S` [s], a lost read-back is repeated at once, although this may delay the next cycle
+by up to the fraction `_AGAIN_SHARE` of a cycle. In longer cycles, it is not repeated: read-backs are rarely destroyed
+there, and a delay would leave the joints unobserved for too long.
 """
 
 OVERDUE_S, OVERTIME_SHARE = 0.075, 0.8
@@ -57,8 +57,9 @@ detected. Every fourth such read-back is of Torque Enable.
 """
 
 _DELAYED_SHARE, _DELAYED_SHARE_IN_DOUBT = 0.01, 0.1
-"""Delay caused by an overdue read-back, as a fraction of the longest time until the next one; the second value applies
-while a foreign value is suspected. After a short delay, the next read-back thus follows sooner than `OVERDUE_S`.
+"""Delay caused by an overdue read-back, as a fraction of the longest time until the next read-back. The second value
+applies while a foreign value is suspected. The next read-back thus follows sooner than `OVERDUE_S` if the delay was
+short.
 """
 
 LOST_GOALS, LOST_OF = 3, 6
@@ -70,7 +71,7 @@ goal in a hundred is lost, missing three of six is rarer than missing two consec
 
 _FADES = 0.98
 _IN_DOUBT_S = 0.3
-"""Time during which more foreign values are expected after one was read [s]."""
+"""How long after reading a foreign value further ones are expected [s]."""
 
 
 _Sightings = deque[tuple[float, int]]
@@ -87,7 +88,7 @@ class Overruled(NamedTuple):
 
 
 def pause_after(delay: float, share: float = _DELAYED_SHARE) -> float:
-    """Longest time until the next overdue read-back after one that delayed a cycle by `delay` [s]."""
+    """Longest time [s] from an overdue read-back that delayed a cycle by `delay` [s] until the next one."""
     return min(OVERDUE_S, delay / share) if delay > 0.0 else OVERDUE_S
 
 
@@ -95,9 +96,9 @@ class ReadBack:
     """Reads back the goals that the servos hold right before a cycle, and occasionally other registers instead.
 
     goal: a span of Bus Watchdog and goal. mode: a span that ends with the settings; `modes` holds each servo's values.
-    A change to one of these settings reverses the motor, shifts every angle, or changes the meaning of goals. torque: a
-    span that begins with Torque Enable. watches_torque: whether Torque Enable is read
-    back regularly, as is necessary if no status shows it. interval: time between two cycles [s], 0 if unknown.
+    A change to one of these settings reverses the motor, shifts every angle, or changes the meaning of goals.
+    torque: a span that begins with Torque Enable. watches_torque: whether Torque Enable is read back regularly, which
+    is necessary if no status includes it. interval: time between two cycles [s], 0 if unknown.
 
     If a cycle leaves no time to read all servos, only one is read (`alone`); the servos take turns.
 
@@ -131,9 +132,9 @@ class ReadBack:
         self.kind = MODES
         """What is read back next."""
         self.place = 0
-        """Index of the servo whose turn it is if only one is read."""
+        """Index of the servo to read if there is only time for one."""
         self.modes_seen_at = -math.inf
-        """Time of the latest read-back in which every servo had the expected settings [s]."""
+        """Time of the latest read-back that found the expected settings in every servo [s]."""
         self._due = {MODES: -math.inf} | ({TORQUE: -math.inf} if watches_torque else {})
         """Times at which the registers other than goals are due [s]."""
         self._goals_since = 0
@@ -151,14 +152,14 @@ class ReadBack:
         self._missed: list[deque[int]] = [deque(maxlen=LOST_GOALS) for _ in ids]
         """Indices of the latest read-backs that found an older goal of this program, by servo."""
         self.watchdogs: list[tuple[int, int]] = []
-        """Index and Bus Watchdog of each servo that answered the latest read-back, if it read goals."""
+        """Index and Bus Watchdog of each servo that answered the latest read-back; empty unless goals were read."""
         self.torque_off: int | None = None
         """Index of a servo whose Torque Enable read 0 when it was last read back; None if there is none."""
         self.overdue_at = math.inf
-        """Time from which a read-back may delay a cycle if nothing is read back before then [s]."""
+        """Time [s] after which a read-back may delay a cycle, unless something is read back earlier."""
         self.doubts_until = -math.inf
         self.sighted: Overruled | None = None
-        """The latest read-back value that this program did not write; it counts as recent until `doubts_until`."""
+        """The latest value read back that this program did not write; it counts as recent until `doubts_until`."""
 
     @property
     def read(self) -> GroupRead:
@@ -190,7 +191,7 @@ class ReadBack:
     def delayed(self, now: float, delay: float, *, alone: bool) -> None:
         """Account for a read-back that has delayed the next cycle by `delay` [s], which may be 0.
 
-        alone: whether only one servo was read; the next read-back is then due correspondingly sooner.
+        alone: whether only one of n servos was read; the next read-back is then due after 1/n of the usual pause.
         """
         if delay == 0.0 and self._was_of_goals and now >= min(self._due.values()):
             return  # what is due did not fit
@@ -237,7 +238,7 @@ class ReadBack:
         told = [(at, each[1]) for at, each in enumerate(intact) if each is not None]
         self.watchdogs = told if self.kind == GOALS else []
         if self.kind == TORQUE:
-            # If an alert explains why torque is off, the next cycle finds it.
+            # If the servo has raised its alert, which explains why torque is off, the next cycle reports it.
             self.torque_off = next(
                 (at for at, is_on in told if not is_on and not (servos[at] or (0,))[0] & ALERT), None
             )
@@ -276,7 +277,9 @@ class ReadBack:
         return True
 
     def _choose_next(self, now: float) -> None:
-        """Choose what to read next; a foreign goal may be the first sign of a mode change, which resets the goal."""
+        """Choose what to read next. Modes are read even while a foreign goal is suspected, since that goal may be the
+        first sign of a mode change, which resets goals.
+        """
         if self.kind == GOALS:
             self._goals_since += 1
         else:
@@ -289,7 +292,7 @@ class ReadBack:
         self.kind = other if now >= self._due[other] and self._goals_since >= enough else GOALS
 
     def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], *, collided: bool) -> list[Overruled]:
-        """Return the values that servos hold but this program did not write."""
+        """Return the values that servos hold although this program did not write them."""
         if self.kind != GOALS:
             found = self._other_settings(servos) if self.kind == MODES else []
             self.is_unexpected = bool(found)

@@ -1,8 +1,8 @@
 """Serial ports that cannot hang: any pyserial URL, bounded reads, and PortLost when the cable is unplugged.
 
 Open one with `open_port`. `Port` does its I/O through pyserial and so supports every URL that pyserial does;
-`NetworkPort` avoids pyserial's waits on a network; `DescriptorPort` reads and writes a local device directly, at half
-pyserial's cost per cycle.
+`NetworkPort` avoids pyserial's waits on a network; `DescriptorPort` reads and writes a local device directly, which
+halves the cost per cycle.
 """
 
 import serial

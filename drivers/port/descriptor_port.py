@@ -19,7 +19,7 @@ _MOST_OVERHEARD = 4096
 
 _LOOKS = 100
 """Number of consecutive replies, all complete and none too early, after which `DescriptorPort.ask` no longer checks for
-pending input in advance: on such a line, pending input is detected because it arrives too early.
+pending input in advance. On such a line, pending input reveals itself: it is available sooner than any reply can be.
 """
 
 _LOOKS_AFTER_LOSS = 2 * _LOOKS
@@ -50,7 +50,7 @@ class DescriptorPort(Port):
         self._wait_ms = poll.poll
 
     def reopen(self) -> bool:
-        # The device may have another name now, and its former name may be that of another arm's adapter.
+        # The device may have a different name now, and its former name may now belong to another arm's adapter.
         self._forget_descriptor()
         with contextlib.suppress(*FAILURES):
             self._serial.close()
@@ -121,7 +121,7 @@ class DescriptorPort(Port):
         return received
 
     def _ask_behind_pending(self, count: int, early_until: float, deadline: float) -> bytes:
-        """Set aside what arrives before the request can have been transmitted, then read the reply as `ask` does."""
+        """Set aside bytes received before the request can have been transmitted, then read the reply as `ask` does."""
         self._looks = _LOOKS_AFTER_LOSS
         while select.select([self._descriptor], [], [], max(0.0, deadline - _now()))[0]:
             is_early = _now() < early_until

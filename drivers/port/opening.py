@@ -1,4 +1,4 @@
-"""Opens serial devices and pyserial URLs, and describes why one cannot be opened or has failed."""
+"""Opens serial devices and pyserial URLs, and describes why a port cannot be opened or has failed."""
 
 import termios
 from typing import Any
@@ -9,7 +9,7 @@ from hil.drivers.adapter.device import is_pseudo_terminal, keep_others_out, othe
 from hil.drivers.errors import NotPermitted, PortNotOpened
 
 FAILURES = (OSError, termios.error)
-# OSError covers SerialException. An unplugged cable makes flushing the input raise termios.error, which is no OSError.
+# OSError covers SerialException. If the cable is unplugged, flushing the input raises termios.error, a separate class.
 
 _REASONS = {
     "No such file": "there is no such device",
@@ -46,7 +46,7 @@ def open_serial(url: str, baud: int) -> Any:
 
 
 def _claim(url: str, opened: serial.Serial) -> None:
-    """Keep other programs from opening the device; raise PortNotOpened if one already has it open."""
+    """Keep other programs from opening the device; raise PortNotOpened if another program already has it open."""
     if is_pseudo_terminal(url):
         return
     keep_others_out(opened.fileno())

@@ -17,7 +17,9 @@ transmitted with this many bits per byte. The true number is ten.
 """
 
 GROWTH = 3
-"""Value of `Port.growth` while torque is off: an adapter may delay a reply beyond the end of the first wait."""
+"""Value of `Port.growth` while torque is off. Waits must grow because an adapter may delay a reply beyond the first
+wait.
+"""
 
 
 class ReplyTime(NamedTuple):
@@ -44,7 +46,7 @@ class Port:
         self.baud = baud
         self.latency = adapter_latency(url)
         self.off_wire = 0.0
-        """Time that the fastest of a few requests took in addition to its time on the wire [s]; 0 if not measured."""
+        """Overhead of an exchange beyond its wire time [s]: the lowest of a few measured values; 0 if not measured."""
         self.latency_measured = False
         """Whether `latency` was measured, because replies arrive later than expected from this kind of adapter."""
         self.echoes = False
@@ -56,7 +58,7 @@ class Port:
         self.late_replies = 0
         """Number of late replies during set-up work since torque was last switched on."""
         self.growth = GROWTH
-        """Factor by which the wait grows with each attempt at a set-up exchange; 1 while torque is on."""
+        """Factor by which the reply timeout grows with each attempt at a set-up exchange; 1 while torque is on."""
         self._serial = opened
         self._timeout: float | None = opened.timeout
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()
@@ -76,7 +78,7 @@ class Port:
         return ReplyTime(timeout, int(timeout * 1e3), _EARLY_BITS * sent / self.baud)
 
     def write(self, data: bytes) -> None:
-        """Send bytes; returns when the device has accepted them, not when they have been transmitted."""
+        """Send bytes. Returns as soon as the device has accepted the bytes, before they have been transmitted."""
         try:
             self._serial.write(data)
         except FAILURES as error:

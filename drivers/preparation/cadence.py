@@ -1,4 +1,4 @@
-"""Chooses how many exchanges are made per sample and per status read; the time on the wire limits both."""
+"""Chooses the number of exchanges per sample and per status read; both are limited by the time on the wire."""
 
 import math
 from collections.abc import Sequence
@@ -17,8 +17,8 @@ STATUS_S = 0.035
 """Time between two status reads [s]."""
 
 _SHARE, _MOST_SHARE = 0.6, 0.9
-"""Fraction of a control cycle that a status read may take on the wire. The second value applies to servos that report
-the supply current, which is slow to reveal a loss of torque.
+"""Fraction of a control cycle that a status read may take on the wire. The second value applies if a servo reports its
+supply current, which reveals a loss of torque only after some time.
 """
 
 
@@ -33,8 +33,8 @@ def cadence(
     if not sample:
         return 1, None, 0
     modes, count = [drive.mode for drive in drives], len(drives)
-    # If the current is not sensed in the motor, a loss of torque shows first in Torque Enable: reading it is worth a
-    # late sample.
+    # If the current is not sensed in the motor, a loss of torque shows first in Torque Enable; reading that register is
+    # worth a late sample.
     share = _MOST_SHARE if any(drive.servo.senses_supply for drive in drives) else _SHARE
     goals = 14 * len(set(modes)) + 3 * count
     every, interval = 1, sample

@@ -35,8 +35,8 @@ _SLOWER_THAN_KNOWN_S = 1.5e-3
 def learn_latency(servo: Servo) -> None:
     """Increase the port's reply timeout if this servo's replies are slow, as over Bluetooth or a network.
 
-    The port's `latency` is raised to the measured value plus a margin if that exceeds what this kind of adapter should
-    need; a full-speed USB adapter needs 1 to 2.5 ms.
+    If the measured latency exceeds what this kind of adapter should need, the port's `latency` is raised to the
+    measured value plus a margin. A full-speed USB adapter needs 1 to 2.5 ms.
     """
     port, usual = servo.port, servo.port.latency
     trips = latest = _trips(servo)
@@ -57,7 +57,7 @@ def learn_latency(servo: Servo) -> None:
     # If nobody replies, the next request raises an error that says so.
     port.latency_measured = taken >= usual + _SLOWER_THAN_KNOWN_S
     if not port.latency_measured:
-        # The delay of a full-speed USB adapter depends on when in a frame of 1 ms a request comes.
+        # The delay of a full-speed USB adapter depends on when a request is made within a frame of 1 ms.
         taken = min(longest, usual + _SLOWER_THAN_KNOWN_S)
     port.latency = max(usual, _MARGIN * taken)
 
@@ -84,7 +84,7 @@ def check_quiet(port: Port) -> None:
 
 
 def overheard(what: str) -> BusOverheard:
-    """Return the error for a bus with another active master; `what` describes what that master does."""
+    """Return the error for a bus on which another master is active; `what` says what that master is doing."""
     return BusOverheard(
         f"Another master {what} on this bus, or the adapter echoes what this program sends. Two masters corrupt each "
         "other's packets, and the other master's goals would move the arm too. Stop the other program or unplug the "

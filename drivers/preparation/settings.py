@@ -32,8 +32,8 @@ PROTECTIVE = (
 but restores them if another program has changed them.
 
 Other writable EEPROM registers are not restored:
-- PWM Limit, Drive Mode, Homing Offset, Return Delay Time: the user may have wanted the change, and restoring it
-  unasked would change what angles and goals mean. The change is reported, with the former value.
+- PWM Limit, Drive Mode, Homing Offset, Return Delay Time: the user may have wanted the change, and undoing it unasked
+  would change what angles and goals mean. The change is reported, together with the former value.
 - ID, Baud Rate, Protocol Type: after a change, the servo no longer answers; the guard reports this.
 - Startup Configuration: the SDK's tables lack it; the next start refuses a servo that switches its torque on by itself.
 - Moving Threshold, External Port Mode: they affect neither the motion nor the replies that this program uses.
@@ -44,7 +44,7 @@ EEPROM = ("Current Limit", "Operating Mode", *PROTECTIVE)
 servos held that value before, so usually no goal has to be written.
 """
 
-# Not restored: LED, which only shines; Torque Enable, which is cut; Goal Position (see above).
+# Not restored: LED, which has no effect; Torque Enable, which is set to 0; Goal Position (see above).
 _GAINS = (
     "Velocity I Gain",
     "Velocity P Gain",
@@ -102,7 +102,7 @@ def read_settings(servo: Servo) -> dict[str, int]:
 
 
 def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
-    """Return the settings with goals clamped to the limits, which another program may have lowered meanwhile.
+    """Return the settings with goals clamped to the limits, since another program may have lowered the limits.
 
     A limit that is itself in `settings` is restored before its goal; otherwise, the servo's present limit applies.
     Raises the errors of `Servo.read`.
@@ -120,12 +120,12 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
 
     Goals are restored as far as the servo's limits allow (`attainable`), and only if torque is still off and the mode
     and the limits have been restored: in current mode, the former goal of a position-controlled servo would mean full
-    torque. The Bus Watchdog is not cleared before that, since it may be all that stops the motor. Each register is read
-    back.
+    torque. The Bus Watchdog is not cleared before the mode and limits have been restored, since it may be the only
+    thing that stops the motor. Each register is read back.
 
     Raises WrongSetting if torque is on, and TorqueDoubted if EEPROM is locked although torque reads back as off. Raises
-    the errors of `Servo.write` only after all other registers have been tried; the error's `in_doubt`
-    and message then name the registers that failed.
+    the errors of `Servo.write` only after all other registers have been tried; the error's `in_doubt` and message then
+    name the registers that failed.
     """
     _refuse_torque(servo)
     settings = attainable(servo, settings)
@@ -169,8 +169,8 @@ def _refuse_torque(servo: Servo) -> None:
 
 
 def _doubted(servo: Servo, failures: Mapping[str, DriverError]) -> TorqueDoubted:
-    """Arm the Bus Watchdog of a servo that locks its EEPROM, so that the servo stops once the bus is silent; return the
-    error to raise. A watchdog that has already tripped is left as it is.
+    """Arm the Bus Watchdog of a servo that locks its EEPROM, so that the servo stops once the bus is silent. A watchdog
+    that has already tripped is left as it is. Return the error to raise.
     """
     with suppress(DriverError):
         if servo.read_despite_error("Bus Watchdog") != WATCHDOG_TRIPPED:
@@ -217,11 +217,12 @@ def _surely(servo: Servo, name: str) -> int | None:
 
 
 def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | None:
-    """Return the name of a register that determines how a servo moves (EEPROM, a goal or the Bus Watchdog) and differs
-    from `settings`, with its value and the one in `settings`; None if there is no such register.
+    """Find a register that determines how a servo moves (EEPROM, a goal or the Bus Watchdog) and differs from
+    `settings`.
 
-    Registers are read in the reverse order of `put_back`, so that replies that lag behind their requests cannot match
-    both times. Raises the errors of `Servo.read`.
+    Return its name, its value, and its value in `settings`; None if there is no such register. Registers are read in
+    the reverse order of `put_back`, so that replies that lag behind their requests cannot match both times. Raises the
+    errors of `Servo.read`.
     """
     wanted = attainable(servo, settings)
     for name in reversed((*EEPROM, *_BOUNDS, "Bus Watchdog")):
@@ -233,7 +234,7 @@ def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | 
 
 
 def arms_itself(servo: Servo) -> bool:
-    """Return whether this servo switches torque on by itself at power-up or reboot. Raises `Servo.read`'s errors."""
+    """Return whether the servo itself switches torque on at power-up or reboot. Raises the errors of `Servo.read`."""
     with suppress(DriverError):
         return bool(servo.read_entry(STARTUP_CONFIGURATION) & TORQUE_ON_AT_STARTUP)
     return False  # older firmware has no such register

@@ -39,8 +39,8 @@ Originals = Mapping[Joint, Mapping[str, int]]
 
 
 class LetDown(NamedTuple):
-    """What was done about torque that was on: the joints that were let down, and those of them that were still moving
-    when their torque was cut.
+    """The joints that were let down because their torque was on at the start. `moving`: those of them that were still
+    moving when their torque was cut.
     """
 
     joints: tuple[Joint, ...] = ()
@@ -81,7 +81,9 @@ def refuse_held(servos: Mapping[Joint, Servo]) -> None:
 
 
 def switched_on(servos: Mapping[Joint, Servo]) -> str:
-    """Describe the servos with torque on and their currents; "" if none. Raises the errors of `Servo.read`."""
+    """Describe the servos whose torque is on, with their currents; "" if there are none. Raises the errors of
+    `Servo.read`.
+    """
     on = [servo for servo in servos.values() if servo.read("Torque Enable") and has_torque(servo)]
     return " and ".join(f"{servo.title}{_current(joint, servo)}" for joint, servo in servos.items() if servo in on)
 
@@ -93,13 +95,14 @@ def _current(joint: Joint, servo: Servo) -> str:
 
 
 def let_sink(held: Mapping[Joint, Servo], clock: Clock, originals: Originals | None = None) -> LetDown:
-    """Ramp the output of held servos down to zero, wait until the joints no longer sink, then cut torque and restore
-    the goals that limited their output to their present values.
+    """Ramp the output of held servos down to zero, wait until the joints no longer sink, cut torque, and then reset the
+    lowered goals to the values that they had before.
 
-    originals: settings to name in messages; an earlier program may already have lowered the present goals.
-    Raises the errors of `Servo.write`. An exception that ends the sinking early gets a note on the goals that are left
-    lowered, since restoring them with torque on would jerk the arm back up. Only if another program raises the lowered
-    goals again is torque cut first, since the arm would otherwise be driven; raises BusShared.
+    originals: settings to name in messages, since an earlier program may already have lowered the present goals.
+
+    Raises the errors of `Servo.write`. If an exception ends the sinking early, the goals stay lowered, since restoring
+    them with torque on would jerk the arm back up; the exception gets a note that lists them. If another program
+    raises the lowered goals again, it would drive the arm, so torque is cut at once and BusShared is raised.
     """
     lowering = _Lowering(held, clock, originals or {})
     try:
@@ -129,7 +132,7 @@ class _Lowering:
         self._written: dict[tuple[Joint, str], int] = {}
 
     def run(self) -> tuple[Joint, ...]:
-        """Reduce the output to zero, wait until the joints are still, and return those still moving after SINKING_S."""
+        """Reduce the output to zero, wait until the joints are at rest, and return those in motion after SINKING_S."""
         for servo in self._held.values():
             if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
                 servo.write("Bus Watchdog", 0)  # tripped, it locks the goals
@@ -178,8 +181,9 @@ class _Lowering:
     def _refuse_rewritten(self, either: int | None = None) -> None:
         """Raise BusShared if a servo with torque on holds a goal that this program did not write.
 
-        A servo whose torque is off has been rebooted, or another program has released it; a tripped Bus Watchdog has
-        zeroed its goal. either: a value that a goal may hold as well, since the latest write may have been lost.
+        Servos with torque off are ignored, since they have been rebooted or released by another program; so are servos
+        whose Bus Watchdog has tripped, which zeroes the goal. either: another permitted value, since the latest write
+        may have been lost.
         """
         for (joint, name), written in self._written.items():
             servo = self._held[joint]

@@ -45,13 +45,13 @@ class TorqueOff:
     """Result of an attempt to cut torque.
 
     confirmed: joints whose servos' torque was read back as off.
-    unconfirmed: the other joints, each with the reason.
+    unconfirmed: joints whose torque could not be confirmed as off, each with the reason.
     unwatched: confirmed or unconfirmed joints whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
     rebooted: confirmed joints whose servos were reset, which disarmed the watchdog armed before torque was switched on.
     disarmed: confirmed joints whose servos were not reset, but whose watchdog another program switched off.
     tripped: joints whose Bus Watchdog may have tripped, which zeroes their goals; it has been cleared since.
-    driven: the remaining joints; another program switches their servos' torque on whenever it is cut.
+    driven: the remaining joints, whose torque another program switches on again whenever it is cut.
     """
 
     confirmed: tuple[Joint, ...]
@@ -83,13 +83,13 @@ class TorqueOff:
         )
 
     def with_doubted(self, joint: Joint, why: str) -> "TorqueOff":
-        """Return the report with a joint no longer confirmed, although its servo's torque reads back as off."""
+        """Return the report with this joint moved to the unconfirmed ones, although its torque reads back as off."""
         confirmed = tuple(each for each in self.confirmed if each != joint)
         return replace(self, confirmed=confirmed, unconfirmed=(*self.unconfirmed, (joint, why)))
 
     def with_later(self, joint: Joint, *, rebooted: bool | None) -> "TorqueOff":
-        """Return the report with a joint now confirmed, since its servo has answered again and its torque reads back as
-        off.
+        """Return the report with this joint moved to the confirmed ones, since its servo has answered again and its
+        torque reads back as off.
 
         rebooted: result of `was_rebooted`.
         """
@@ -169,8 +169,8 @@ def cut_torque(
     watchdog: float,
     interrupts: list[BaseException],
 ) -> tuple[tuple[Joint, ...], tuple[tuple[Joint, str], ...]]:
-    """Cut torque on all servos and read it back. Return the confirmed joints, and the others, each with the reason why
-    it is not confirmed.
+    """Cut torque on all servos and read it back. Return the confirmed joints, and each unconfirmed joint with the
+    reason.
 
     silent: servos that did not answer the last exchange.
     watchdog: timeout of the servos' Bus Watchdogs [s].
@@ -219,8 +219,8 @@ def cut_torque(
 def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
     """Send torque off to all servos in one packet. Raises PortLost.
 
-    The packet is a Sync Write to these servos only, since others on the bus may be in use. It is sent twice, since a
-    packet may be lost.
+    The packet is a Sync Write to these servos only, since other servos on the bus may be in use. It is sent twice in
+    case one copy is lost.
     """
     _tell(port, servos, "Torque Enable", 0, times=2)
 
@@ -245,8 +245,8 @@ def _tell(port: Port, servos: Mapping[Joint, Servo], register: str, value: int, 
 def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> frozenset[Joint]:
     """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more.
 
-    Return the joints whose watchdog has tripped or may have tripped; once a watchdog is off, this can no longer be
-    read.
+    Return the joints whose watchdog has tripped or may have tripped, since a servo does not report this once its
+    watchdog is off.
     """
     tripped = set(servos)
 
@@ -262,7 +262,7 @@ def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseExcepti
 
 
 def cut_again(servo: Servo, *, armed: bool) -> bool | None:
-    """Cut the torque of a servo that did not answer before; return whether it was rebooted, as `was_rebooted` does.
+    """Cut the torque of a servo that did not answer before; return the result of `was_rebooted`, None if not `armed`.
 
     armed: whether its Bus Watchdog was armed before torque was switched on; if so, the watchdog is switched off. Raises
     the errors of `Servo.write`.
@@ -283,9 +283,9 @@ def is_torque_on(servo: Servo) -> bool | None:
 
 
 def has_torque(servo: Servo) -> bool | None:
-    """Read whether a servo's torque is on; None if its answers may belong to other requests.
+    """Read whether a servo's torque is on; None if its answers disagree and may thus belong to other requests.
 
-    Raises the errors of `Servo.read`, except that of `Servo.read_surely` for readings that disagree.
+    Raises the errors of `Servo.read`.
     """
     try:
         return bool(servo.read_surely("Torque Enable"))
@@ -294,8 +294,8 @@ def has_torque(servo: Servo) -> bool | None:
 
 
 def was_rebooted(servo: Servo) -> bool | None:
-    """Whether a servo whose watchdog is no longer armed was rebooted; None if the watchdog is armed or nothing is
-    known.
+    """Whether a servo whose watchdog is no longer armed was rebooted; None if the watchdog is still armed or the servo
+    does not answer.
 
     A reboot also resets the goal to its limit; a program that only writes to the watchdog leaves the goal as it is. A
     late reply to an earlier request could be mistaken for the answer, so another register is read before and after.
@@ -308,7 +308,7 @@ def was_rebooted(servo: Servo) -> bool | None:
 
 
 def _confirm(servo: Servo, interrupts: list[BaseException], *, at_once: bool) -> Exception | None:
-    """Switch torque off and read it back; return None, or the failure.
+    """Switch torque off and read it back; return None if this succeeded, otherwise the exception.
 
     at_once: try only once, and send nothing after a missing reply.
     """
@@ -317,9 +317,9 @@ def _confirm(servo: Servo, interrupts: list[BaseException], *, at_once: bool) ->
 
 
 def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) -> Exception | None:
-    """Run `action`; return None, or the failure.
+    """Run `action`; return None if it succeeded, otherwise the exception.
 
-    An interrupt is appended to `interrupts` and the action is run again.
+    If an interrupt arrives, it is appended to `interrupts`, and the action is run again.
     """
     for _ in range(_INTERRUPTS_BORNE):
         try:
@@ -376,7 +376,7 @@ def signals_held_back() -> Iterator[None]:
         if number not in came:
             came.append(number)
 
-    # None is a handler that was not installed from Python: it could not be restored, so it is left alone.
+    # The handler is None if it was not installed from Python. It could not be restored, so it is not replaced.
     former = {number: handler for number in _SIGNALS if (handler := signal.getsignal(number)) is not None}
     try:
         for number in former:

@@ -31,7 +31,7 @@ class TorqueSwitch:
     """Switches torque on and off for all servos on one port together.
 
     servos: the servos in bus order, keyed by single-servo joints. After any error, the same object can still cut
-    torque; `torque_off_report` then shows whether it succeeded.
+    torque; `torque_off_report` then shows whether that succeeded.
     """
 
     def __init__(self, port: Port, servos: Mapping[Joint, Servo]) -> None:
@@ -57,8 +57,8 @@ class TorqueSwitch:
     def refuse_switched_on(self) -> None:
         """Check that torque is still off, after this program has found it off or switched it off.
 
-        If it is on, another program has switched it on; this method then cuts torque on all servos. Raises BusShared or
-        TorqueNotOff.
+        If torque is on, another program has switched it on. In that case, this method cuts torque on all servos and
+        raises BusShared, or TorqueNotOff if torque off could not be confirmed.
         """
         if not (found := switched_on(self._servos)):
             return
@@ -73,7 +73,7 @@ class TorqueSwitch:
                 raise TorqueNotOff(str(report))
 
     def wait_switched_off(self, until: float) -> None:
-        """Wait until the time `until` [s, on the port's clock], calling `refuse_switched_on` at least every WATCH_S."""
+        """Wait until the time `until` [s, on the port's clock]; meanwhile, call `refuse_switched_on` every WATCH_S."""
         clock = self.port.clock
         self.refuse_switched_on()
         while (now := clock.now()) < until:
@@ -104,7 +104,7 @@ class TorqueSwitch:
             self._torque_on(watchdog)
             yield
         finally:
-            # No statement may stand between `finally` and `try`, so that an interrupt before torque_off is caught here.
+            # There must be no statement between `finally` and `try`: an interrupt before torque_off must be caught.
             try:
                 report = self.torque_off()
             except BaseException:
@@ -141,8 +141,8 @@ class TorqueSwitch:
     def torque_off(self) -> TorqueOff:
         """Cut torque on every servo and read it back (`hil.drivers.torque.off`), even if some servos fail.
 
-        Signals are held back meanwhile; an interrupt that still arrives is raised once all servos have been tried and
-        `torque_off_report` is set.
+        Signals are held back in the meantime. An interrupt that nevertheless arrives is raised only after all servos
+        have been tried and `torque_off_report` has been set.
         """
         interrupts: list[BaseException] = []
         with signals_held_back():
@@ -183,13 +183,13 @@ class TorqueSwitch:
             tell_torque_off(self.port, self._servos)
 
     def torque_now(self) -> dict[Joint, bool | None]:
-        """Read whether the torque of each servo is on; None if unknown. Omits servos reported as unconfirmed."""
+        """Read whether each servo's torque is on (None if unknown), except for servos reported as unconfirmed."""
         report = self.torque_off_report
         unconfirmed = set() if report is None else {joint for joint, _ in report.unconfirmed}
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
 
     def has_torque(self) -> bool:
-        """Read outside the control cycle whether all servos have torque on; False if one does not answer."""
+        """Read, outside the control cycle, whether the torque of all servos is on; False if a servo does not answer."""
         return all(is_torque_on(servo) for servo in self._servos.values())
 
     def cut_foreign_torque(self, on: Collection[Joint]) -> None:
@@ -201,7 +201,7 @@ class TorqueSwitch:
             raise interrupts[0]
 
     def zero_own_goals(self, on: Collection[Joint]) -> None:
-        """Zero the goals of servos still in this program's mode; otherwise, they would follow its last goals."""
+        """Zero the goals of servos that are still in this program's mode, so that they do not follow its last goals."""
         for drive in on:
             with suppress(DriverError):
                 servo = self._servos[drive]
@@ -233,9 +233,9 @@ class TorqueSwitch:
         return True
 
     def _fault(self, drive: Joint, *, its_own: bool = True) -> str:
-        """Return the fault of one servo as text, or "" if it reports none and another servo has raised the alert.
+        """Return the message for a servo's fault, or "" if it reports no fault and the alert came from another servo.
 
-        its_own: whether this servo has raised the alert.
+        its_own: whether this servo itself has raised the alert.
         """
         try:
             error = self._servos[drive].hardware_error()

@@ -102,7 +102,7 @@ class FakeBus:
 
     @property
     def servos(self) -> dict[int, EmulatedServo]:
-        """Servos by current ID, advanced to the clock's current time; if several have the same ID, only the last."""
+        """Servos by current ID, advanced to the clock's current time; of servos with the same ID, only the last."""
         self.advance(self.clock.now())
         return {servo.id: servo for servo in self._servos}
 
@@ -234,7 +234,7 @@ class FakeBus:
             self._move_plant(until)
 
     def _advance_by_events(self, until: float) -> None:
-        """Advance, pausing at each tick, fault and watchdog trip, so that each affects the plant from then on."""
+        """Advance in stages that end at each tick, fault and watchdog trip, so that these affect the plant at once."""
         while self._now < until:
             counting = [servo for servo in self._servos if servo.watchdog_s]
             trip = min((servo.heard_at + servo.watchdog_s for servo in counting), default=math.inf)

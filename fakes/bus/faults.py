@@ -60,7 +60,8 @@ class FaultKind(StrEnum):
 class FaultFacts(NamedTuple):
     """The effect of one kind of fault, and the meaning, default and range (inclusive) of its `amount`.
 
-    amount: what the amount is, with its unit; "" if the kind has none. whole: whether it must be a whole number.
+    amount: meaning of the amount, with its unit; "" if this kind has no amount. whole: whether the amount must be a
+    whole number.
     """
 
     does: str
@@ -142,7 +143,7 @@ REPLY_FAULTS = frozenset(
 INSTRUCTION_FAULTS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTRUCTION})
 
 MOST_REMEMBERED = 100_000
-"""`Faults.happened` holds up to twice this number of faults, and always at least the last ones of this number."""
+"""`Faults.happened` keeps at least this number of the latest faults, and fewer than twice this number."""
 
 
 class Fault(Described):
@@ -163,7 +164,7 @@ class Fault(Described):
     @field_validator("amount")
     @classmethod
     def _allowed_amount(cls, amount: float | None, others: ValidationInfo) -> float | None:
-        kind = others.data.get("kind")  # absent if it is wrong itself
+        kind = others.data.get("kind")  # absent if the kind itself is invalid
         if kind is not None and (wrong := _wrong_amount(kind, amount)):
             raise ValueError(wrong)
         return amount
@@ -188,7 +189,7 @@ class Fault(Described):
 
 
 def _wrong_amount(kind: FaultKind, amount: float | None) -> str:
-    """Return what is allowed, in words, if a fault of this kind cannot have this amount; otherwise ""."""
+    """Return a description of the allowed amounts if a fault of this kind cannot have this amount, otherwise ""."""
     facts = FAULTS[kind]
     if amount is None or (facts.amount and facts.allows(amount)):
         return ""
@@ -209,9 +210,10 @@ Effect = Callable[[Fault], None]
 class Faults:
     """The faults of one bus: pending ones, active ones, and a record of those that took effect.
 
-    happened: those that took effect; of a long run, the latest (see `MOST_REMEMBERED`). count: number of all of them.
-    begin, end: apply a fault to the servos, and undo it. catch_up: advances the bus to the present, so that what is
-    added or cleared now does not take effect at the time of the last packet.
+    happened: the faults that took effect; in a long run, only the latest (see `MOST_REMEMBERED`). count: how many took
+    effect in total. begin, end: functions that apply a fault to the servos, and undo it. catch_up: function that
+    advances the bus to the present, so that faults added or cleared now do not take effect at the time of the last
+    packet.
     """
 
     def __init__(self, seed: int, begin: Effect, end: Effect, catch_up: Callable[[], None] = lambda: None) -> None:
@@ -234,7 +236,7 @@ class Faults:
     def add(self, *faults: Fault) -> None:
         """Add faults; those whose start time has passed begin immediately.
 
-        Raises ValueError for an amount that is not allowed, which is possible in a modified copy of a fault.
+        Raises ValueError for an amount that is not allowed, which a modified copy of a fault may contain.
         """
         for fault in faults:
             if wrong := _wrong_amount(fault.kind, fault.amount):
@@ -271,7 +273,7 @@ class Faults:
         self._look_ahead()
 
     def error(self, servo_id: int, now: float) -> int:
-        """Return the ERR byte with which a servo answers under a status_error fault; 0 without one.
+        """Return the ERR byte with which a servo answers during a status_error fault; 0 if no such fault is active.
 
         now: time since the bus was created [s].
         """

@@ -115,7 +115,7 @@ class Hand:
     def move(self, *moves: Move) -> None:
         """Schedule moves, each of which starts `at` seconds from now.
 
-        Raises PlantError if the plant's joints cannot be held, ValueError for an ID that no servo has, and for a move
+        Raises PlantError if the plant's joints cannot be held, and ValueError for an ID that no servo has or for a move
         that starts now while its joint's torque is on. A move that starts later is skipped if torque is on by then.
         """
         for move in moves:
@@ -127,7 +127,7 @@ class Hand:
         self.schedule(*moves)
 
     def schedule(self, *moves: Move) -> None:
-        """Schedule moves as `move` does, but skip any move whose joint's torque is on when it should start."""
+        """Schedule moves like `move`, but skip every move whose joint has torque on when the move should start."""
         now = self._time()
         free = {self._joint_of(move) for move in moves} - self._grips.keys()
         if moves and not isinstance(self._plant, CanBeHeld):

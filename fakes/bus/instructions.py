@@ -107,7 +107,7 @@ class Instructions:
         baud = self._line.baud
         for servo in self._servos:
             if servo.baud == baud and servo.connected and now >= servo.ready_at:
-                servo.heard_at = now  # feeds its watchdog, and marks it below as having received this packet
+                servo.heard_at = now  # feeds the servo's watchdog, and shows below that it has received this packet
         if packet.id != BROADCAST_ID:
             self._single(packet, now)
         elif (act := self._broadcast.get(packet.instruction)) is not None:

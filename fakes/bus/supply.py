@@ -18,7 +18,7 @@ class Supply(Described):
     def load(self, servos: Sequence[EmulatedServo], current: Sequence[float], now: float) -> None:
         """Set every servo's supply voltage for these motor currents [A]. now: bus time [s].
 
-        A servo draws its motor current times the duty cycle of its bridge from the supply.
+        The current that a servo draws from the supply is its motor current times the duty cycle of its bridge.
         """
         drawn = sum(
             abs(servo.supply_share(amp) * amp)

@@ -1,7 +1,8 @@
 """Precomputed group reads of the control cycle.
 
 These requests read Present Current, Velocity and Position of several servos, or registers without measurements, such as
-goals. The replies are the same as those of the general path in `hil.fakes.bus.instructions`, but take half the time.
+goals. The replies are the same as those of the general path in `hil.fakes.bus.instructions`, but are computed in half
+the time.
 """
 
 import functools

@@ -163,7 +163,7 @@ class Wire:
     def collide(self, start: float, end: float) -> bool:
         """Return whether a transmission from `start` to `end` collides with a servo's transmission.
 
-        If so, the servo's bytes from `start` on are lost. The other transmission is lost because the caller does not
+        If so, the servo's bytes from `start` on are lost. The other transmission is lost as well: the caller must not
         deliver it.
         """
         kept: deque[Arriving] = deque()

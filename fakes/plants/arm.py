@@ -155,9 +155,10 @@ class Arm(Described):
 
 
 def base_parameters(arm: Arm | None, time: float = math.inf) -> dict[str, float]:
-    """Return the true base parameters of this arm at `time` [s], with the estimator's names and in its order [SI].
+    """Return the true base parameters of this arm at `time` [s], with the estimator's names and order [SI units].
 
-    Empty if `arm` is None, since the parameters of other plants are unknown. By default, the drives are warm.
+    The result is empty if `arm` is None, which stands for a plant with unknown parameters. By default, the drives are
+    warm.
 
     Effects that no base parameter represents are left out: dry friction beyond Coulomb friction (Stribeck rise, load),
     presliding, the current loop's lag, saturation, ripple, cogging, a cable's stiffness, backlash, hard stops. The

@@ -1,8 +1,9 @@
 """An arm with gear backlash: each joint has a rotor and an output shaft, which are in contact at the ends of a gap.
 
 The rotor, whose inertia is multiplied by the gear ratio squared, is subject to the motor's torque, all friction and the
-hard stops. The links are attached to the output shafts, as are the servos' encoders. Within the gap, no torque is
-transmitted between the two; at its ends, the gears act as a spring and a damper that can push but not pull.
+hard stops. The links and the servos' encoders are attached to the output shafts. Within the gap, no torque is
+transmitted between rotor and output shaft; at the ends of the gap, the gears act as a spring and a damper that can push
+but not pull.
 
 The contact is stiff: such an arm takes about ten times as long to simulate as one without backlash.
 """
@@ -152,8 +153,8 @@ class _Links:
 
     @property
     def lightness(self) -> float:
-        """Upper bound for all poses on the acceleration per unit of joint torque [1/(kg m^2)]: the trace of the mass
-        matrix divided by its determinant.
+        """Upper bound on the acceleration per unit of joint torque in any pose [1/(kg m^2)]: the largest ratio of trace
+        to determinant of the mass matrix.
         """
         if len(self.angle) == 1:
             return 1.0 / self._first

@@ -61,7 +61,7 @@ class SpatialChain:
         self._held[0, joint] = JAM if jammed else 0.0
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        # Just stiff enough to move a bare rotor within one step.
+        # The grip is just stiff enough to move a bare rotor within one step.
         grip = max(2.0 * self._drive[ARMATURE, joint] / self._longest, LEAST_GRIP)
         self._held[1:, joint] = (0.0, 0.0) if velocity is None else (grip, velocity)
 
@@ -75,7 +75,7 @@ class SpatialChain:
         run(self._chain, self._drive, self._held, self._state, command, remaining, longest, self._work, self._room)
 
     def equations(self, q: Sequence[float], v: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Return, for a given state, the mass matrix and the torques at which the acceleration is zero.
+        """Return the mass matrix in a given state, and the joint torques at which the acceleration is zero.
 
         The mass matrix (joints, joints) [kg m^2] excludes the rotors; the torques are (joints,) [N m].
         """

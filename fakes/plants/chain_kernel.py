@@ -203,8 +203,8 @@ def _run_loop(  # noqa: PLR0912
     """Integrate over `remaining` [s] in steps of at most `longest` [s].
 
     held (3, joints): friction that jams a joint [N m]; damping between the joint and a hand that grips it [N m s/rad],
-    0 without a hand; and the hand's velocity [rad/s].
-    state (4, joints): angles, velocities, previous accelerations, currents; updated in place.
+    0 if no hand grips it; the hand's velocity [rad/s].
+    state (4, joints): angles, velocities, accelerations in the previous step, and currents; updated in place.
     """
     q, v, a, amps = state[0], state[1], state[2], state[3]
     M, bias = work[5], work[6]

@@ -53,7 +53,7 @@ class Motor:
         self._shaped = bool(
             drive.ripple or drive.cogging or drive.load or drive.stops or drive.saturation or drive.cable_stiffness
         )
-        # Torque falls below linear like 1 / sqrt(1 + x^2), scaled so that the given fraction is lost at that current.
+        # The torque is the linear one times 1 / sqrt(1 + x^2), scaled to lose `saturation` at `saturation_current`.
         self._bent = (1.0 / (1.0 - drive.saturation) ** 2 - 1.0) / (
             drive.torque_constant * drive.saturation_current
         ) ** 2
@@ -92,17 +92,17 @@ class Motor:
         """Torque constant [N m/A], offset and Coulomb level [N m], Stribeck rise [1], 1 / Stribeck velocity [s/rad]."""
         self.viscous = drive.viscous * viscous
         self.plain = (*self.constants, self.viscous, self._lag, self._width)
-        """`constants`, viscous friction [N m s/rad], current lag [s] and width of smooth friction [rad/s]: all
-        parameters that a plain drive needs.
+        """All parameters of a plain drive: `constants`, viscous friction [N m s/rad], current lag [s], and width of
+        smooth friction [rad/s].
         """
 
     @property
     def is_plain(self) -> bool:
-        """Whether the drive has only lag, torque, offset and Stribeck friction, smooth or with stiction."""
+        """Whether the drive has only effects that `plain` describes: lag, offset, viscous and Stribeck friction."""
         return not (self._shaped or self.bristle_stiffness or self.jammed or self.held_at is not None)
 
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
-        """Return the effect of the drive over a step of `step` [s], given angle and velocity at its middle.
+        """Return the effect of the drive over a step of `step` [s], given angle and velocity at the middle of the step.
 
         command: commanded current [A]. Returns the mean torque without stiction [N m], the level of the dry friction
         that can hold the joint [N m], the slope of the smooth friction at this velocity [N m s/rad], and the current at
@@ -138,7 +138,7 @@ class Motor:
         if self.jammed:
             level += JAM
         if self.held_at is not None:
-            # Just stiff enough to move a bare rotor within one step.
+            # The grip is just stiff enough to move a bare rotor within one step.
             grip = max(2.0 * armature(self._drive) / step, LEAST_GRIP)
             torque += grip * (self.held_at - velocity)
             slope += grip
@@ -155,7 +155,7 @@ class Motor:
         return end + (self.bristle_torque - end) * exp(-self.bristle_stiffness * abs(velocity) * step / self._level)
 
     def lag(self, step: float) -> tuple[float, float]:
-        """Return the fraction of a current error that remains after `step` [s], and its mean over that time."""
+        """Return the fraction of a current error that remains after `step` [s], and the mean fraction over the step."""
         if self._lag and step != self._step:
             # Exact solution of a first-order lag under a constant command.
             self._step = step

@@ -1,4 +1,4 @@
-"""Plants, i.e. the mechanisms driven by the fake servos: interface and loading.
+"""Interface and loading of plants, i.e. of the mechanisms that the fake servos drive.
 
 A custom plant is any object with the members of `Plant`, created by a function that takes the description's
 `plant_options` as keyword arguments:
@@ -98,9 +98,9 @@ _leave = {"code": False}
 
 
 def allow_code(allowed: bool = True) -> None:
-    """Permit descriptions to call any importable function for the rest of this process; off by default.
+    """Permit descriptions to call any importable function for the rest of this process; this is off by default.
 
-    Opening a file whose `plant` names a function runs that function with the file's arguments.
+    The reason is that opening a file whose `plant` names a function runs that function with the file's arguments.
     """
     _leave["code"] = allowed
 

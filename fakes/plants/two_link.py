@@ -51,7 +51,7 @@ class TwoLink:
             (first.mass * first.centre + beyond * first.length) * arm.weight,
             second.mass * second.centre * arm.weight,
         )
-        """Coupling, inertia of link 2, inertias with rotors [kg m^2], and both links' weight at the joints [N m]."""
+        """Coupling, inertia of link 2, inertias with rotors [kg m^2], and gravity torques of both links [N m]."""
         self._longest_step = min(motor.longest_step for motor in self._motors)
         self._time = 0.0
         q1, q2, v1, v2 = map(float, (*arm.start, *velocity))
@@ -120,7 +120,8 @@ def _run(  # noqa: PLR0912, PLR0915
     per step would make it take 1.5 times as long. A step in which a joint's velocity changes sign is split at that
     point (`cut`).
 
-    arm: `TwoLink._terms`. drives: `Motor.plain` of both motors. motors: None if both are plain, the only compiled case.
+    arm: `TwoLink._terms`. drives: `Motor.plain` of both motors. motors: None if both are plain; only this case is
+    compiled.
     """
     swing, inertia_second, turned_first, turned_second, weight_first, weight_second = arm
     kt_1, offset_1, coulomb_1, rise_1, per_v1, viscous_1, lag_1, width_1 = drives[:8]
@@ -231,7 +232,7 @@ def _about_joint(link: Link) -> float:
 
 
 def _until_zero(old: float, new: float) -> float:
-    """Return the fraction of the step after which the velocity is zero; 1 if it does not cross zero or starts there."""
+    """Return the fraction of the step after which the velocity crosses zero; 1 if it does not, or starts at zero."""
     return old / (old - new) if old * new < 0.0 else 1.0
 
 

@@ -38,14 +38,14 @@ _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 
 
 def obeyed_current(memory: Memory) -> int:
-    """Return the applied Goal Current [ticks]; Current Limit applies even if lowered after the goal was written."""
+    """Return the Goal Current that is applied [ticks]. Current Limit applies even if it was lowered afterwards."""
     goal, limit = memory.get("Goal Current"), memory.get("Current Limit")
     return max(-limit, min(limit, goal))
 
 
 @dataclass(frozen=True, slots=True)
 class Goals:
-    """The registers used by the controller, in their own units."""
+    """Values of the registers that the controller uses, in the units of the registers."""
 
     mode: int
     pwm: int
@@ -187,7 +187,10 @@ class Controller:
         return self._limited(proportional, goals.position_i / 65_536 * error, limit)
 
     def _limited(self, proportional: float, integrated: float, limit: float) -> float:
-        """Return the limited sum; the integral is frozen while the limit is active (anti-windup)."""
+        """Return the sum of proportional term and integral, clamped to +-limit.
+
+        The integral is frozen while the limit is active (anti-windup).
+        """
         wanted = proportional + self._integral + integrated
         if abs(wanted) <= limit or wanted * integrated < 0.0:
             self._integral += integrated

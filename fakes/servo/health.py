@@ -89,7 +89,7 @@ class Health:
     def cool(self) -> None:
         """End a fault that heats the servo.
 
-        Without a thermal model, its temperature returns at the rate `COOLING_K_S` to what it was before the fault.
+        Without a thermal model, the servo then returns to its temperature before the fault, at the rate `COOLING_K_S`.
         """
         self._heated_by = max(0, self._heated_by - 1)
 
@@ -109,5 +109,5 @@ class Health:
         return self._overloaded_s > overload.time_s
 
     def rest(self) -> None:
-        """Reset the overload timer, as a reboot does; the temperature remains."""
+        """Reset the overload timer, as a reboot does; the temperature is unchanged."""
         self._overloaded_s = 0.0

@@ -44,7 +44,7 @@ class Memory:
         self.data[register.address : end] = value.to_bytes(register.size, "little", signed=register.signed)
 
     def read(self, address: int, length: int) -> bytes | None:
-        """Return the bytes of an address range; None if it begins or ends outside any register."""
+        """Return the bytes of an address range; None if the first or last address belongs to no register."""
         if (address, length) not in self._readable:
             if not (length > 0 and address in self._defined and address + length - 1 in self._defined):
                 return None
@@ -72,12 +72,12 @@ class Memory:
             for index in range(count):
                 at = first_address + 2 * index
                 target = self.data[at] | self.data[at + 1] << 8
-                # One that points to indirect data (by default its own) is plain memory.
+                # Data whose indirect address points to indirect data (by default, to itself) are plain memory.
                 if target != first_data + index and target in self._defined and not self._is_indirect_data(target):
                     self._points[first_data + index] = target
 
     def split(self, address: int, data: bytes) -> tuple[list[tuple[Register, int]], int]:
-        """Return the registers and values in a write, and an error number if the write violates register boundaries."""
+        """Split a write into registers and values; also return an error number if it violates register boundaries."""
         if not (self._points and self.is_indirect(address, len(data))):
             return self._split_stretch(address, data)
         writes: list[tuple[Register, int]] = []

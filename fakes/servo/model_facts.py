@@ -4,8 +4,8 @@ Source: ROBOTIS e-Manual, pages x/<model> and, for the motors, _data/dxl_x_info.
 of the e-Manual's repository ROBOTIS-GIT/emanual (revisions of 2018 to 2024). Differences from some revisions: the range
 of Min Voltage Limit, given there as 110 to 300 with a factory value of 95, is 95 to 160 here, as on the sister models.
 Protocol Type only accepts 2, because a fake servo does not support any other. Drive Mode accepts bit 3 (Torque On by
-Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the others. Velocity Limit of
-the XH430-W210 is that of the XD430-T210, although the oldest page of the XH430-W210 itself states 360.
+Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the other pages. Velocity Limit
+of the XH430-W210 is that of the XD430-T210, although the oldest page of the XH430-W210 itself states 360.
 
 Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
 tens of percent, which is enough for position moves to look realistic.
@@ -69,7 +69,7 @@ class ModelFacts:
     """Whether Present Current is the supply current instead of the motor current (330 series)."""
     indirect: Blocks = ((168, 224, 28), (578, 634, 28))
     indirect_of_firmware: tuple[int, Blocks] | None = None
-    """The only firmware version with different blocks, and these blocks."""
+    """The only firmware version with blocks other than `indirect`, and its blocks."""
 
 
 _Facts = RegisterFacts
@@ -166,9 +166,10 @@ _FIRMWARE_52 = (52, ((168, 208, 20),))
 """Indirect data of the 330 series. Sources contradict each other for firmware before 52.
 
 dynamixel-sdk 4.1 and ROBOTIS' dynamixel_hardware_interface (pull request 69) have two control tables: one with the data
-at 224, and one named fw52, with the data at 208. The e-Manual (2026-09): "Firmware versions prior to V53 support up to
-20 Indirect Address/Data items [...] for Indirect Data is 208 ~ 227"; from then on, 28 at 224. All agree on 208 for
-firmware 52. Before 52, the fake uses 224 like ROBOTIS' own programs, which would otherwise read zeros.
+at 224, and one named fw52, with the data at 208. The e-Manual (2026-09) says: "Firmware versions prior to V53 support
+up to 20 Indirect Address/Data items [...] for Indirect Data is 208 ~ 227"; later versions have 28 items at 224. All
+sources agree on 208 for firmware 52. For earlier firmware, the fake uses 224 like ROBOTIS' own programs, which would
+otherwise read zeros.
 """
 
 
@@ -283,8 +284,8 @@ X_INITIAL: Mapping[str, Mapping[str, int]] = {
     "XH540-V270": _X_INITIAL,
     "XW540-H260": _X_INITIAL,
 }
-"""Factory values in the EEPROM of X models whose ranges are unknown here; for the 24 V models, only values that all of
-them share.
+"""Factory values in the EEPROM of X models whose ranges are unknown here. For the 24 V models, only values that all of
+them share are given.
 """
 
 _STRENGTH = (0, 1023)

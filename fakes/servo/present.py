@@ -96,7 +96,7 @@ class Present:
     def clear(self, body: bytes, moving: bool, position: float) -> int:
         """Execute the instruction Clear (reset the turn count); return the error number.
 
-        Whether real servos return the same error numbers is uncertain, except for Result Fail.
+        It is uncertain whether real servos return the same error numbers, except for Result Fail.
         """
         if len(body) != len(_CLEAR_TURNS):
             return StatusError.DATA_LENGTH
@@ -171,7 +171,7 @@ class Present:
         return current
 
     def _measure_other(self, now: float, position: float) -> None:
-        """Update a non-X-series model's Realtime Tick and Present Position (in ticks of an X-series encoder)."""
+        """Update Realtime Tick and Present Position of a model outside the X series (in ticks of X-series encoders)."""
         register = self._model.registers.get("Present Position")
         if register is not None and register.size == 4:
             self._memory.store(register, round(self.ticks(position)))
@@ -179,7 +179,7 @@ class Present:
         self._memory.set("Realtime Tick", tick)
 
     def forget_turns(self, position: float) -> None:
-        """Remove whole turns from Present Position, before Homing Offset is added, at a joint angle [rad]."""
+        """Make Present Position start within one turn (before Homing Offset is added) at this joint angle [rad]."""
         self._turn_ticks = 0
         self._shift_changed()
         raw = round(self.ticks(position)) - self._homing_ticks()

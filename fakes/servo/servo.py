@@ -3,12 +3,12 @@
 The behaviour follows the ROBOTIS e-Manual (protocol2 and x/<model> pages). Where the manual is silent, the fake chooses
 the behaviour that demands more of a client: see "Conformance" in docs/fake-bus.md. Moreover:
 
-- A write must begin and end on register boundaries. One that begins or ends inside a writable register causes a Data
-  Length error; other violations cause an Access error. A read may begin inside a register; undefined bytes between two
-  registers read as 0. A read that begins or ends at an undefined address causes an Access error.
+- A write must begin and end on register boundaries. A write that begins or ends inside a writable register causes a
+  Data Length error; other violations cause an Access error. A read may begin inside a register; undefined bytes between
+  two registers read as 0. A read that begins or ends at an undefined address causes an Access error.
 - When the Bus Watchdog trips, the goal of the operating mode stops the motor: Goal Current, Goal PWM or Goal Velocity
-  becomes 0, or Goal Position becomes Present Position, which the servo continues to hold. The goals that only act as
-  limits in this mode remain, and torque stays enabled. The watchdog's register then accepts only 0.
+  becomes 0, or Goal Position becomes Present Position, which the servo continues to hold. Goals that only act as limits
+  in this mode keep their values, and torque stays enabled. The register Bus Watchdog then accepts only 0.
 - At power-up, and after a change of Operating Mode, Goal Current and Goal PWM equal their limits: if a client enables
   torque in current mode without first writing a goal, full current flows. Goal Velocity is 0.
 
@@ -297,7 +297,7 @@ class EmulatedServo(Powered):
 
     def write(self, address: int, data: bytes) -> int:
         """Write a range of the control table; return the error number."""
-        # What a control cycle writes takes a fast path with the same result as the general one.
+        # For the goals written in control cycles, there is a fast path with the same result as the general one.
         if address == _GOAL_PWM and len(data) == 2 and self._goal_pwm_limit >= 0:
             return self._write_goal_pwm(data)
         if address != _GOAL_CURRENT or len(data) != 2 or not self._takes_goal_current:
@@ -423,7 +423,7 @@ class EmulatedServo(Powered):
         self._torque = self.torque_enabled
         counting = self._torque and watchdog != WATCHDOG_TRIPPED
         self.watchdog_s = watchdog * WATCHDOG_UNIT_S if counting else 0.0
-        """Silence after which the watchdog trips [s]; 0 while it is inactive."""
+        """Duration of silence after which the watchdog trips [s]; 0 while the watchdog is inactive."""
 
         self.present.derive(self.supply_share)
         self._mode = self.operating_mode if self.model.operating_modes else -1
@@ -447,7 +447,7 @@ class EmulatedServo(Powered):
         takes_goal_pwm = accepts and self._mode != CURRENT_MODE and "Goal PWM" in memory
         self._goal_pwm_limit = memory.get("PWM Limit") if takes_goal_pwm else -1
         """Largest Goal PWM that the fast path accepts [ticks]; -1 if every write takes the general path."""
-        # The fast path bypasses the controller, in which the supply or, in one mode, the goal limits the current.
+        # The fast path bypasses the controller, which limits the current by the supply or, in one mode, by the goal.
         by_controller = self._is_limited or self._mode == CURRENT_POSITION_MODE
         self._takes_goal_current = accepts and not by_controller and self._current_limit >= 0
         if self.needs_ticks:

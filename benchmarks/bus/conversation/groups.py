@@ -32,7 +32,7 @@ class Conversation(SingleInstructions):
     # What determines whether and how a servo answers
 
     def level(self) -> None:
-        """Change Status Return Level; whether the write is answered may depend on the old or the new level."""
+        """Change Status Return Level. Either the old or the new level may determine whether the write is answered."""
         servo, level = self.any_servo(), self.random.choice((0, 1, 2, 2, 2))
         before = servo.level
         raw = packet(servo.id, codec.WRITE, bytes((LEVEL, 0, level)))
@@ -87,8 +87,8 @@ class Conversation(SingleInstructions):
         self._follow(servo)
 
     def secondary(self) -> None:
-        """Write to a Secondary ID: a servo obeys if the register is in RAM, but not if it is in EEPROM, and does not
-        answer (x/shadow_id).
+        """Write to a Secondary ID: the servo must obey if the register is in RAM but not if it is in EEPROM. In neither
+        case may it answer (manual: x/shadow_id).
         """
         servo = self.any_servo()
         if servo.rules.torque:
@@ -258,7 +258,7 @@ class Conversation(SingleInstructions):
         self.ask("noise", clutter + packet(servo.id, codec.PING), [(servo, {FINE})])
 
     def nonsense(self) -> None:
-        """Send undefined instructions, undefined IDs, and a status packet."""
+        """Send undefined instructions, a ping to an undefined ID, and a status packet."""
         servo = self.any_servo()
         undefined = self.random.choice((0x00, 0x07, 0x0F, 0x21, 0x77, 0x99))
         self.ask(f"undefined {undefined:#x}", packet(servo.id, undefined), self.answers(servo, {INSTRUCTION}))

@@ -118,7 +118,7 @@ class SingleInstructions(Host):
         self.settle(servo, [row.address])
 
     def goal_position(self) -> None:
-        """Write Goal Position; position mode allows values within its limits, other modes 256 turns either way."""
+        """Write Goal Position. Position mode allows values within its limits; other modes allow +-256 turns."""
         servo = self.any_servo()
         held = servo.rules.held
         if held.get(WATCHDOG) or 48 not in held or 52 not in held or 11 not in held:
@@ -136,7 +136,7 @@ class SingleInstructions(Host):
                 self.differ(f"goal_position {goal}", read)
 
     def watchdog(self) -> None:
-        """Check that Bus Watchdog trips only with torque on and no packets, and blocks goals until it is cleared."""
+        """Check that Bus Watchdog trips if packets cease, but only with torque on, and blocks goals until cleared."""
         servo = self.any_servo()
         if servo.level < 2 or servo.alert:
             return
@@ -162,8 +162,8 @@ class SingleInstructions(Host):
         self.settle(servo, [WATCHDOG, TORQUE_ENABLE])
 
     def alarm(self) -> None:
-        """Set Min Voltage Limit above the supply: every status then carries the alert, and torque is off if Shutdown
-        has that bit; only restoring the limit and rebooting ends this.
+        """Set Min Voltage Limit above the supply voltage. Until the limit has been restored and the servo rebooted,
+        every status must carry the alert, and torque must be off if Shutdown contains the bit for this error.
         """
         servo = self.any_servo()
         held = servo.rules.held
@@ -171,7 +171,7 @@ class SingleInstructions(Host):
             return
         row = servo.rules.rows[34]
         assert row.high is not None
-        before, shuts_down = held[34], servo.model.startswith("XL330")  # Shutdown: 53 there, otherwise 52
+        before, shuts_down = held[34], servo.model.startswith("XL330")  # Shutdown is 53 on the XL330, otherwise 52
         servo.rules.write(34, row.high.to_bytes(2, "little"))
         raw = packet(servo.id, codec.WRITE, b"\x22\0" + row.high.to_bytes(2, "little"))
         self.kinds["alarm"] += 1
@@ -185,7 +185,7 @@ class SingleInstructions(Host):
         self._write(servo, TORQUE_ENABLE, b"\0")
         self._write(servo, 34, before.to_bytes(2, "little"))
         self.settle(servo, [70])
-        servo.alert = False  # not in the status of the Reboot either: ROBOTIS' own clients would take it for a failure
+        servo.alert = False  # the answer to Reboot carries no alert: ROBOTIS' own clients would take it for a failure
         self.ask("reboot", packet(servo.id, codec.REBOOT), self.answers(servo, {FINE}))
         self._booted(servo)
         self.settle(servo, [70])
