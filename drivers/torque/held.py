@@ -193,7 +193,7 @@ class _Lowering:
                 raise BusShared(
                     f"{joint.title}: while the arm was being let down, {name} was lowered to {written}, but reads "
                     f"{found}: another program is driving the arm. Torque was cut before the arm had come to rest, so "
-                    "that it was not driven on. End that program, or unplug its controller, then start again."
+                    "that it was not driven on. Stop that program, or unplug its controller, then start again."
                 )
 
     @property

@@ -119,7 +119,7 @@ class TorqueOff:
             if joint in self.disarmed:
                 yield (
                     f"{joint.title}: another program has switched off its Bus Watchdog; it was not rebooted, since it "
-                    "still holds its goal. End that program."
+                    "still holds its goal. Stop that program."
                 )
 
     def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:

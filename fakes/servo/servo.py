@@ -437,7 +437,10 @@ class EmulatedServo(Powered):
         self.needs_ticks = self.health.changes or (moves and (self._mode != CURRENT_MODE or self._is_limited))
         """Whether the servo's state changes with time alone, so that the bus must call `tick`."""
 
-        if self._driven:
+        if self._driven and self._is_limited:  # the next step of the servo's loop applies the goal
+            stall = most / FULL_PWM * self.supply_v / self.model.resistance_ohm
+            self.motor_current_a = max(-stall, min(stall, self.motor_current_a))
+        elif self._driven:
             self.motor_current_a = self.goal_current_ticks * self._current_per_tick
         elif not moves:
             self.motor_current_a = 0.0

@@ -109,6 +109,8 @@ class JointFaults:
         velocity = state.velocity[index]
         if self._recent.contradicts(index, velocity):
             return Cause.FROZEN, self._not_its_velocity(index, velocity)
+        if self._recent.is_unreachable(index, velocity):
+            return Cause.VELOCITY, self._faster_than_its_motor(index, velocity)
         return (
             Cause.VELOCITY,
             f"is moving at {state.velocity[index]:.2f} rad/s, more than its velocity limit of "
@@ -131,6 +133,14 @@ class JointFaults:
         return (
             f"{said}: this reading is wrong{slips}. Check the servo and whether a device between adapter and servo "
             "changes its replies; replace the servo if it happens again."
+        )
+
+    def _faster_than_its_motor(self, index: int, velocity: float) -> str:
+        moved, seconds, *_ = self._recent.travels(index)[0]
+        return (
+            f"is moving at {velocity:.2f} rad/s, and its position has changed by {moved:+.3f} rad within "
+            f"{1e3 * seconds:.0f} ms: its motor alone cannot turn it that fast. Its horn slips, something has struck "
+            "the arm, or its encoder is wrong. Check the horn and its screws, the encoder and its magnet."
         )
 
     def _not_followed(self, index: int, state: State) -> Fault:

@@ -400,3 +400,20 @@ def test_pwm_limit_and_goal_pwm_limit_the_motor_in_current_modes_too(mode: int, 
         each.run(0.15)
     assert abs(rig.read("Present PWM")) <= 107
     assert abs(rig.shaft.velocity[0]) < 0.5 * abs(free.shaft.velocity[0])
+
+
+def test_goal_pwm_limits_the_current_also_in_the_moments_after_a_new_goal() -> None:
+    """A goal written between two steps of the servo's loop must not drive the motor, or be read back, unlimited."""
+    rig = Rig(0)
+    rig.write("Goal Current", 0)
+    rig.write("Goal PWM", 44)
+    rig.write("Torque Enable", 1)
+    most = 44 / 885 * 12.0 / rig.servo.model.resistance_ohm
+    drawn = []
+    for step in range(1, 30):
+        rig.write("Goal Current", 300 + step)
+        assert abs(rig.servo.motor_current_a) <= 1.01 * most
+        rig.run(0.0013)
+        drawn.append(rig.shaft.current[0])
+        assert abs(rig.read("Present Current")) * 2.69e-3 <= 1.05 * most
+    assert 0.5 * most < max(drawn) <= 1.01 * most and min(drawn) >= 0.0

@@ -68,8 +68,14 @@ def test_an_encoder_jump_stops_and_the_same_way_over_lost_samples_does_not(arm: 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(
     ("claimed", "moves", "cause"),
-    [(15.1, 14.9, Cause.VELOCITY), (15.1, 1.0, Cause.FROZEN), (15.1, -10.0, Cause.FROZEN), (60.0, 10.0, Cause.FROZEN)],
-    ids=["agrees", "hardly moves", "moves back", "no servo reaches it"],
+    [
+        (15.1, 14.9, Cause.VELOCITY),
+        (15.1, 1.0, Cause.FROZEN),
+        (15.1, -10.0, Cause.FROZEN),
+        (60.0, 10.0, Cause.FROZEN),
+        (19.5, 19.0, Cause.VELOCITY),
+    ],
+    ids=["agrees", "hardly moves", "moves back", "no servo reaches it", "agrees, but no servo reaches it"],
 )
 @pytest.mark.parametrize("rate", [20.0, 100.0, 400.0])
 def test_a_velocity_beyond_its_limit_that_contradicts_the_position(
@@ -88,6 +94,7 @@ def test_a_velocity_beyond_its_limit_that_contradicts_the_position(
     assert ("contradicts its position" in str(stop.value)) == (cause is Cause.FROZEN)
     assert ("can reach" in str(stop.value)) == (claimed == 60.0)
     assert ("begun to slip" in str(stop.value)) == (cause is Cause.FROZEN and claimed != 60.0)
+    assert ("its horn slips, something has struck" in str(stop.value).lower()) == (claimed == 19.5)
 
 
 def test_a_frozen_encoder_is_seen_between_lost_replies(arm: Arm) -> None:
