@@ -472,9 +472,11 @@ class Told:
             false = np.abs(heard[:, 1] - true) > LIE_RAD
         else:
             false = np.abs(heard[:, 2] - true) > LIE_RAD_S + LIE_SHARE * np.abs(true)
+        # A false reading counts until the next one arrives; between two samples, the program reads again.
         steps = round(1.2 * interval / STEP_S) + 1
-        for index in at[false]:
-            wrong[index : index + steps] = True
+        until = np.minimum(at + steps, np.append(at[1:], time.size))
+        for begin, end in zip(at[false], until[false], strict=True):
+            wrong[begin : end + 1] = True
         return wrong
 
     def silent(self, joint: int, time: NDArray[Any], interval: float, ended: float) -> NDArray[np.bool_]:
