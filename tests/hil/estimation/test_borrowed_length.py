@@ -37,7 +37,10 @@ def test_the_right_length_makes_the_coupling_of_a_small_motion_more_accurate() -
     assert abs(value - COUPLING) < 2.0 * std
 
 
-@pytest.mark.parametrize("ratio", [0.6, 0.75, 1.3, 1.5])
+SLOW = pytest.mark.slow  # each fit takes 20 s of processor time
+
+
+@pytest.mark.parametrize("ratio", [0.6, pytest.param(0.75, marks=SLOW), pytest.param(1.3, marks=SLOW), 1.5])
 def test_a_wrong_length_is_doubted_rather_than_believed(ratio: float) -> None:
     found = estimate(ratio * LENGTH)
     value, std = coupling(found)
