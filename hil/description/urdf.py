@@ -5,7 +5,7 @@ Format: wiki.ros.org/urdf/XML. Only geometry and inertias are read; meshes are n
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +13,13 @@ import numpy as np
 
 from hil.description.arm import ArmDescription, ArmFileError, ArmJoint, Array, Body, check_size
 from hil.description.regular_file import not_a_file
+from hil.description.urdf_doubts import (
+    angles_in_degrees,
+    bulky_links,
+    impossible_inertias,
+    left_out_mimics,
+    without_inertia,
+)
 
 MOST_LENGTH = 3.0  # m from joint to joint; a larger value suggests millimetres
 MOST_MASS = 100.0  # kg per link; a larger value suggests grams
@@ -71,12 +78,14 @@ def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
         )
         rotation, translation = np.eye(3), np.zeros(3)
     check_units(arm, path)
-    doubts = tuple(
-        f'link "{each.link}": no mass distribution can have this inertia; it is used only as an initial guess'
-        for each in arm
-        if not physical[each.link] or not each.body.is_physical
+    mimics = {name: joint.mimics for name, joint in tree.items()}
+    doubts = (
+        *impossible_inertias(arm, physical),
+        *without_inertia(root, {link for each in arm for link in (each.link, *each.fixed)}),
+        *bulky_links(arm),
+        *angles_in_degrees(root),
+        *left_out_mimics(mimics, held, chosen),
     )
-    doubts += tuple(_without_inertia(root, {link for each in arm for link in (each.link, *each.fixed)}))
     return ArmDescription(path, base, tuple(arm), tuple(held), doubts)
 
 
@@ -118,20 +127,6 @@ def _links(root: ET.Element, path: Path) -> tuple[dict[str, Body], dict[str, boo
     if not bodies:
         raise ArmFileError(f"{path} has no links")
     return bodies, {name: body.mass == 0.0 or body.is_physical for name, body in bodies.items()}
-
-
-def _without_inertia(root: ET.Element, links: Container[str | None]) -> Iterator[str]:
-    """Yield one sentence per moving link that has a mass but no inertia."""
-    for element in root.findall("link"):
-        inertial = element.find("inertial")
-        mass = None if inertial is None else inertial.find("mass")
-        if inertial is None or mass is None or inertial.find("inertia") is not None or element.get("name") not in links:
-            continue
-        if float(mass.get("value", "nan")) > 0.0:
-            yield (
-                f'link "{element.get("name")}" has a mass but no <inertia>, so it counts as a point '
-                "mass, which is used only as an initial guess"
-            )
 
 
 def _body(element: ET.Element | None, where: str, path: Path) -> Body:
@@ -271,7 +266,8 @@ def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) ->
             )
         if joint.mimics is not None:
             raise ArmFileError(
-                f'{path}: joint "{name}" mimics "{joint.mimics}", so it has no motor of its own: leave it out'
+                f'{path}: joint "{name}" mimics "{joint.mimics}", so it has no motor of its own: leave it out. The '
+                "model then assumes that its link does not move relative to the one that carries it"
             )
     branch = max((_way_to(tree, base, name, path) for name in names), key=len)
     found = [joint.name for joint in branch if joint.name in names]
@@ -285,9 +281,12 @@ def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) ->
         raise ArmFileError(f"{path}: from the base, the joints are {', '.join(found)}: list them in this order")
     between = [joint for joint in branch if joint.name not in names and joint.kind != "fixed"]
     if between:
+        add = "add it, or make it fixed if it never moves"
+        if between[0].kind not in TURNING:
+            add = "make it fixed if it never moves; otherwise, this arm cannot be identified"
         raise ArmFileError(
             f'{path}: joint "{between[0].name}" ({between[0].kind}) lies before "{names[-1]}" and is not among the '
-            "arm's joints: add it, or make it fixed if it never moves"
+            f"arm's joints: {add}"
         )
     return branch
 

@@ -1,5 +1,6 @@
 """URDF files: geometry and inertias as in other programs, and an error message for every fault."""
 
+import re
 from pathlib import Path
 
 import mujoco
@@ -91,6 +92,30 @@ def test_an_inertia_that_no_body_has_is_a_doubt(tmp_path: Path) -> None:
     arm = read_urdf(written(tmp_path, odd + "</robot>"))
     (warning,) = doubted_inertias(arm)
     assert warning == f"{arm.path.name}: {arm.doubts[0]}." and "upper" in warning
+
+
+PLACEHOLDER = INERTIAL.format(mass=1.0).replace("1e-3", "1")
+FOLLOWER = link("tip") + joint("wrist", "lower", "tip", more='<mimic joint="elbow"/>')
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "doubt"),
+    [
+        ('link="lower"/><axis', 'link="lower"/><origin rpy="0 90 0"/><axis', 'joint "elbow" .* rpy="0 90 0".* degrees'),
+        (
+            INERTIAL.format(mass=0.2),
+            PLACEHOLDER,
+.* at 1.2 m .*placeholder',
+        ),
+        ("1e-3", "0", 'link "upper" has a mass but an <inertia> of zero'),
+        ("", FOLLOWER, 'joint "wrist" mimics "elbow", so its link moves with the arm'),
+    ],
+    ids=["degrees", "placeholder", "no inertia", "mimic"],
+)
+def test_what_is_probably_not_meant_is_a_doubt(old: str, new: str, doubt: str, tmp_path: Path) -> None:
+    odd = TWO.replace(old, new, 3 if old == "1e-3" else 1) if old else TWO + new
+    (said,) = read_urdf(written(tmp_path, odd + "</robot>"), ["shoulder", "elbow"]).doubts
+    assert re.search(doubt, said)
 
 
 @pytest.mark.parametrize(
