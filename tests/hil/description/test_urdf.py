@@ -105,7 +105,7 @@ FOLLOWER = link("tip") + joint("wrist", "lower", "tip", more='<mimic joint="elbo
         (
             INERTIAL.format(mass=0.2),
             PLACEHOLDER,
-.* at 1.2 m .*placeholder',
+            'link "upper" is about 0.1 m long, .* 1.2 m .*placeholder',
         ),
         ("1e-3", "0", 'link "upper" has a mass but an <inertia> of zero'),
         ("", FOLLOWER, 'joint "wrist" mimics "elbow", so its link moves with the arm'),
