@@ -15,6 +15,7 @@ from hil.config.experiment import MIN_RATE
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
+from hil.drivers.others.heard import MOST_STRANGERS
 from hil.drivers.read_back_exchange import ReadBackExchange
 from hil.setup.realtime import on_time
 
@@ -41,6 +42,7 @@ class ExchangeMode:
     median_s, longest_s: median and maximum of the round trips [s]. slowest_s: median of the round trips with the
     slowest kind of read [s]. usual_s: `slowest_s` plus the 90 % quantile of how much each round trip exceeds the median
     for its kind of read [s]. lost: number of exchanges, out of CYCLES, with replies that were lost, not just late.
+    strangers: number of packets heard that another program sent or requested.
     """
 
     one_write: bool
@@ -50,6 +52,7 @@ class ExchangeMode:
     slowest_s: float
     longest_s: float
     lost: int
+    strangers: int = 0
 
     @property
     def name(self) -> str:
@@ -103,6 +106,8 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
         modes = [_faster(*pair) for pair in zip(modes, measure_modes(bus), strict=True)]
     used = _configured(bus, modes)
     found, fix = f"{used.whole_rate} Hz possible with {used.name}", _fix(used, modes, wanted)
+    if shared := shared_with_another(modes):
+        return RateReport(tuple(modes), found, shared)
     if fix and used.sound and used.highest_rate >= wanted:
         # `hil identify` would run at this rate, and only a busy computer would miss deadlines.
         found = f"{floor(used.highest_rate)} Hz possible with {used.name}, or {used.whole_rate} Hz with some margin"
@@ -112,6 +117,16 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
         )
         return RateReport(tuple(modes), found, "", tight)
     return RateReport(tuple(modes), found, fix, "" if fix else _delayed(used, wanted))
+
+
+def shared_with_another(modes: Sequence[ExchangeMode]) -> str:
+    """Name another program that was heard while these modes were measured; "" if there was none."""
+    if (strangers := max(mode.strangers for mode in modes)) <= MOST_STRANGERS:
+        return ""
+    return (
+        f"Another program uses this bus: {strangers} packets that it sent or requested were heard during {CYCLES} "
+        "exchanges, and they collide with replies. Stop that program, or unplug its controller."
+    )
 
 
 def seldom_as_measured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> str:
@@ -226,7 +241,8 @@ def _measure(bus: ServoBus, goals: Sequence[int], *, fast: bool, one_write: bool
     slowest = max(median.values())
     usual = slowest + float(np.quantile(excess, USUAL))
     longest = float(trips[~lost].max()) if not lost.all() else PATIENCE_S
-    return ExchangeMode(one_write, fast, float(np.median(trips)), usual, slowest, longest, int(lost.sum()))
+    median_s, strangers = float(np.median(trips)), int(max(0.0, exchange.heard.strangers))
+    return ExchangeMode(one_write, fast, median_s, usual, slowest, longest, int(lost.sum()), strangers)
 
 
 def _delayed(used: ExchangeMode, wanted: float) -> str:

@@ -6,7 +6,7 @@ from hil import fakes
 from hil.config.schema import parse_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
-from hil.setup.bus_rate import CYCLES, choose_mode, measure_modes
+from hil.setup.bus_rate import CYCLES, choose_mode, measure_modes, shared_with_another
 from hil.setup.config_template import RATES, ArmAnswers, MeasuredBus, arm_toml
 
 
@@ -29,7 +29,9 @@ def measured_bus(arm: ArmAnswers, path: Path) -> tuple[MeasuredBus | None, str]:
     fast = mode.fast or not any(each.fast for each in modes)
     found = MeasuredBus(float(rate), mode.rate, mode.one_write, fast)
     said = f"This bus can sustain {mode.whole_rate} Hz with {mode.name}; rate = {rate:g} is set in the file."
-    if mode.lost:
+    if shared := shared_with_another(modes):
+        said += f" But the measurement was disturbed. {shared}"
+    elif mode.lost:
         said += (
             f" But {mode.lost} of {CYCLES} replies were lost: check cables, supply and termination, and whether other "
             "programs keep this computer busy."

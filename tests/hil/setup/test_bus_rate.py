@@ -99,3 +99,13 @@ def test_a_rate_that_only_leaves_the_computer_little_time_is_not_refused(tmp_pat
     (finding,) = [each for each in hil.check(path).findings if each.what == "rate"]
     assert finding.level == "warning" and f"or {possible} Hz with some margin" in finding.found
     assert re.search(r"leave only [1-9] % of a period .* at most " + str(possible), finding.fix)
+
+
+def test_another_program_heard_while_the_rate_is_measured_is_named(arm_file: ArmFile) -> None:
+    """Its packets collide with replies, so cables and exchange modes must not be blamed for the lost ones."""
+    path = arm_file()
+    other = '\n[[fake.faults]]\nkind = "other_master"\nservo = 2\nat = 0.0\nduration = 100.0\namount = 0.02\n'
+    path.write_text(path.read_text(encoding="utf-8") + other, encoding="utf-8")
+    (finding,) = [each for each in hil.check(path).findings if each.what == "rate"]
+    assert finding.level == "stop" and re.search(r"Another program uses this bus: \d+ packets", finding.fix)
+    assert "one_write" not in finding.fix
