@@ -35,7 +35,7 @@ TESTS = {
     "hil/experiment/guard.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/command_limits.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/checks/joint_checks.py": [f"{_EXPERIMENT}/test_guard.py"],
-    "hil/experiment/checks/joint_faults.py": [f"{_EXPERIMENT}/test_guard.py", f"{_EXPERIMENT}/test_guard_stops.py"],
+    "hil/experiment/checks/joint_faults.py": [f"{_EXPERIMENT}/test_guard.py", f"{_EXPERIMENT}/stops"],
     "hil/experiment/checks/current_noise.py": [
         f"{_EXPERIMENT}/checks/test_following.py",
         f"{_EXPERIMENT}/test_guard.py",
@@ -53,7 +53,7 @@ TESTS = {
     "hil/experiment/pace.py": [f"{_EXPERIMENT}/stream/test_stream_schedule.py"],
     "hil/experiment/stream.py": [
         f"{_EXPERIMENT}/stream/test_stream_schedule.py",
-        *(f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py"),
+        *(f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/stops"),
     ],
     "hil/drivers/exchange.py": [
         *("tests/drivers/test_exchange_cycles.py", "tests/drivers/test_heard_instead.py"),
