@@ -66,7 +66,7 @@ def streams(config_path: Path, runs: int) -> dict[str, float]:
 
 
 def _shares(config_path: Path) -> dict[str, float]:
-    """Time of bus and plant per cycle, from one more run in which they are timed (timing a call takes 0.3 us)."""
+    """Time spent in the bus and in the plant per cycle, from an additional run (timing a call takes 0.3 us)."""
     config = load_config(config_path)
     spent = {"stream": 0.0, "write": 0.0, "read": 0.0, "plant": 0.0}
     arm_seconds: list[float] = []

@@ -66,7 +66,7 @@ def _rms(masses: list[tuple[float, float]]) -> Array | None:
 
 
 def bound(rate: float) -> Array:
-    """Cramer-Rao bound of m1 and m2 [kg] for the plant as printed and noise of the paper's variance."""
+    """Cramer-Rao bound of m1 and m2 [kg] for the plant as printed in the paper and noise of its variance."""
     excitation = own_lines()
     columns = []
     for moved in (replace(ARM, mass_1=ARM.mass_1 + 1e-5), replace(ARM, mass_2=ARM.mass_2 + 1e-5)):

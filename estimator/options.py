@@ -258,11 +258,11 @@ class SelectionOptions:
     keep_ratio: float = 0.98
     """A richer model is kept only if its error is below this fraction of the error of the best model so far."""
     explained_residual: float = 1.02
-    """RMS residual in units of the noise below which no further term is tried."""
+    """RMS residual, in units of the noise, below which no further term is tried."""
     near_residual: float = 5.0
-    """RMS residual in units of the noise below which a richer model's fit starts at the simpler model's minimum."""
+    """RMS residual, in units of the noise, below which a richer model's fit starts at the simpler model's minimum."""
     steady_residual: float = 5.0
-    """RMS residual in units of the noise below which changes in friction are searched for; a larger model error may
+    """RMS residual, in units of the noise, below which changes in friction are searched for; a larger model error may
     look like such a change.
     """
     presliding_residual: float = 1.2

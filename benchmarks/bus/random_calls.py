@@ -62,7 +62,7 @@ def indirect_data(model: str, firmware: int) -> int:
 
 
 class Client:
-    """Calls one arm through the SDK's port, and records the differences from the rules."""
+    """Sends calls to one arm through the SDK's port and records every deviation from the rules."""
 
     def __init__(self, port: Any, seed: int, sleep: Callable[[float], None] = time.sleep) -> None:
         self.port, self.handler, self.sleep = port, sdk.PacketHandler(2.0), sleep

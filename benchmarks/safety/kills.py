@@ -21,7 +21,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks.machine import machine
-from tests.support.kills import ANSWERED_BEFORE_S, kill_campaign
+from tests.support.stops.kills import ANSWERED_BEFORE_S, kill_campaign
 
 
 def main() -> None:

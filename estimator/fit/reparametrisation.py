@@ -108,8 +108,8 @@ class Coordinates:
     def undisguised(self, x: Array) -> Array:
         """Return `x` with constant Stribeck rises converted to Coulomb friction; `x` may have further coordinates.
 
-        If the Stribeck velocity exceeds all speeds of the motion, only the sum of rise and Coulomb friction is
-        determined, and a fit that has drifted so far rarely returns to lower Stribeck velocities.
+        If the Stribeck velocity exceeds every speed in the motion, the data determine only the sum of the rise and the
+        Coulomb friction, and a fit that has drifted that far rarely returns to lower Stribeck velocities.
         """
         changed = x.copy()
         for index, name in enumerate(self.names):

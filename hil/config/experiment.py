@@ -49,7 +49,7 @@ class ExperimentConfig(Table):
     )
     max_settling_periods: int = Field(5, ge=1, le=100)
     periods: int = Field(1, ge=1, le=1000, description="number of settled periods to record")
-    held_out: bool = Field(True, description="run a second multisine with other phases to validate the model")
+    held_out: bool = Field(True, description="run a second multisine with different phases to validate the model")
     seed: int = Field(1, ge=0, le=2**63 - 1)
 
     @model_validator(mode="after")

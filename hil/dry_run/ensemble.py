@@ -50,7 +50,7 @@ class Ensemble:
 
 
 def prior_ensemble(config: Config, count: int, seed: int = 0) -> Ensemble:
-    """Draw arms from link lengths and `[arm.prior]`. Raises ConfigError."""
+    """Draw arms with the configured link lengths; `[arm.prior]` gives the other distributions. Raises ConfigError."""
     base = base_draws(config, count, seed)
     physics = tuple(Physics.of({name: float(values[arm]) for name, values in base.items()}) for arm in range(count))
     return Ensemble(physics, scale_draws(config, count, seed), "prior")

@@ -126,7 +126,7 @@ class Belief:
         return belief
 
     def _drawn_to(self, config: Config, seen: Seen, moved: Mask, random: np.random.Generator) -> "Belief":
-        """Apply the smoother to the motion of the joints that `moved` (joints,)."""
+        """Apply the smoother to the motion of the joints selected by `moved` (joints,)."""
         index = np.unique(np.linspace(0, seen.command.shape[1] - 1, _TIMES).astype(int))
         index = index[np.isfinite(seen.position[:, index]).all(axis=0)]
         step = np.array([joint.joint.servo.position_unit for joint in config.joints])

@@ -210,8 +210,8 @@ class SafeShares:
         return found, why
 
     def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
-        """Return the first safe fraction of the amplitude, why a larger one is unsafe, and by how much the clearance of
-        the larger one is too small [m].
+        """Return the first safe fraction of the amplitude, why the next larger one is unsafe, and how much clearance
+        that one lacks [m].
 
         If neither the first nor the last fraction is safe when tried on a few arms, those in between are not tried.
         """

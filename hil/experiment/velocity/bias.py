@@ -15,7 +15,7 @@ STEP_RAD_S = 0.025
 """Resolution of the velocity register [rad/s]."""
 
 UNSURE_RAD_S = 0.003
-"""Accepted change of the bias, which may depend on the motion, for example if a joint sticks and slips [rad/s]."""
+"""Largest accepted change of the bias [rad/s]; the bias may depend on the motion, as when a joint sticks and slips."""
 
 NOISE_RAD, NOISE_TIMES = 0.01, 3.0
 """Smallest assumed error [rad], and the assumed error as a multiple of the RMS residual."""

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.support.edits import FEWER_SAMPLES
-from tests.support.interrupted import STAGES, interrupt
 from tests.support.paths import CONFIGS
+from tests.support.stops.interrupted import STAGES, interrupt
 
 OFTEN = {"held-out part": signal.SIGINT, "report": signal.SIGTERM}
 """Stages tried in every run of the tests, and with which signal; each takes a process."""

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from hil.config.schema import Config
-from tests.support import kills
-from tests.support.kills import Kill, fake_arm, kill_campaign
+from tests.support.stops import kills
+from tests.support.stops.kills import Kill, fake_arm, kill_campaign
 
 BUSY_S = 5.0
 

@@ -6,7 +6,7 @@ from hil.config.schema import parse_config
 from hil.plan.plan import Plan, make_plan
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
-from tests.support.stopped_runs import SHORTER, Arm
+from tests.support.stops.stopped_runs import SHORTER, Arm
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from hil.plan.plan import Plan
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
 from hil.setup.session import servo_session
-from tests.support.stopped_runs import Arm, assert_stopped, fault, once, run_until_stopped, swing_elbow
+from tests.support.stops.stopped_runs import Arm, assert_stopped, fault, once, run_until_stopped, swing_elbow
 
 
 @pytest.mark.parametrize(("where", "after"), [(servo_session, "others_on_the_bus"), (run, "_check_pose")])

@@ -17,7 +17,7 @@ from hil.plan.plan import Plan
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
 from tests.support.spied_plant import call_at
-from tests.support.stopped_runs import Arm, assert_stopped, fault, once, stall, swing_elbow
+from tests.support.stops.stopped_runs import Arm, assert_stopped, fault, once, stall, swing_elbow
 
 
 def braked_samples(arm: Arm, folder: Path, ports: list[Any], plan: Plan, then: Callable[[], None] | None) -> int:

@@ -18,7 +18,7 @@ from hil.fakes.bus.faults import FaultKind
 from hil.plan.plan import Plan, make_plan
 from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFolder
-from tests.support.stopped_runs import (
+from tests.support.stops.stopped_runs import (
     STIFF_GUARD,
     Arm,
     assert_stopped,

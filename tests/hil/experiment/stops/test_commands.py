@@ -14,7 +14,7 @@ from hil.fakes.bus.faults import FaultKind
 from hil.plan.plan import Plan
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
-from tests.support.stopped_runs import Arm, assert_stopped, fault, once, run_until_stopped
+from tests.support.stops.stopped_runs import Arm, assert_stopped, fault, once, run_until_stopped
 
 
 def test_torque_off_is_repeated_until_a_deaf_servo_hears_it(

@@ -21,7 +21,7 @@ from hil.plan.plan import Plan, make_plan
 from hil.runs.recording import Phase, sample_type
 from hil.runs.run_folder import RunFolder
 from hil.setup.session import servo_session
-from tests.support.stopped_runs import Arm, assert_stopped, fault, once, run_until_stopped, swing_elbow
+from tests.support.stops.stopped_runs import Arm, assert_stopped, fault, once, run_until_stopped, swing_elbow
 
 
 def rewritten(ports: list[Any], register: str, value: int) -> None:

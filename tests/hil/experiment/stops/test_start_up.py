@@ -15,7 +15,7 @@ from hil.experiment.run import run_experiment
 from hil.fakes.bus.faults import FaultKind
 from hil.plan.plan import Plan
 from hil.runs.run_folder import RunFolder
-from tests.support.stopped_runs import Arm, assert_stopped, fault, once, run_until_stopped
+from tests.support.stops.stopped_runs import Arm, assert_stopped, fault, once, run_until_stopped
 
 
 def test_the_servos_own_current_limit_is_lowered_for_the_run_and_restored_after_a_stop(

@@ -1,6 +1,6 @@
 """A `hil` command that is interrupted at a given stage: it sends itself a signal there, as a person or a system would.
 
-    python -m tests.support.interrupted ramp SIGINT identify arm.toml --out run
+    python -m tests.support.stops.interrupted ramp SIGINT identify arm.toml --out run
 
 The stage is reached when a function is called, or when a sample of some phase is recorded, so that the moment is exact
 and no time is lost; the signal is a real one, and everything after it is up to the program.
@@ -167,7 +167,7 @@ def interrupt(stage: str, number: signal.Signals, words: list[str], folder: Path
     """
     from tests.support.processes import forked  # which a new interpreter does without
 
-    command = ["tests.support.interrupted", stage, number.name, *words]
+    command = ["tests.support.stops.interrupted", stage, number.name, *words]
     options: Any = {"cwd": folder, "env": ENVIRONMENT, "capture_output": True, "text": True, "timeout": 600}
     done = (
         subprocess.run([sys.executable, "-m", *command], **options, check=False)
