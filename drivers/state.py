@@ -194,7 +194,7 @@ class Converter:
         return self._any_state(tuple(map(operator.mul, self._drive_units, ticks)), reply)
 
     def _any_state(self, sent: tuple[float, ...], reply: Reply) -> State:
-        """Convert a reply as `state` does, but for any span, and even if servos refused the request or did not reply."""
+        """Convert a reply as `state` does, but for any span, and even if a servo refused or did not reply."""
         # Additional registers precede the three that are always read, but voltage and temperature follow them.
         at = 1 if reply.span in (0, SLOW_SPANS) else 2 if reply.span == 1 else self._answer_length(reply) - 3
         drive, velocity, position, error, missing = [], [], [], [], []
