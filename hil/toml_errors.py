@@ -3,6 +3,7 @@
 import difflib
 import re
 from collections.abc import Sequence
+from datetime import date, time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_origin
 
@@ -248,7 +249,9 @@ def _key(location: Sequence[str | int]) -> str:
 
 
 def _shown(value: object) -> str:
-    text = repr(value).replace("True", "true").replace("False", "false")
+    # Dates and times are the only values of a TOML file that repr writes as calls of Python classes.
+    text = str(value) if isinstance(value, date | time) else repr(value)
+    text = text.replace("True", "true").replace("False", "false")
     return text if len(text) <= 60 else text[:57] + "..."
 
 

@@ -25,12 +25,12 @@ def init(
     from hil.drivers.port import open_port
     from hil.drivers.servo_model import BAUD_RATES
     from hil.errors import ConfigError
-    from hil.export.source import write_text
     from hil.next_step import next_step
     from hil.setup.config_template import arm_toml
     from hil.setup.interview import interview
     from hil.setup.measured_bus import measured_bus
     from hil.setup.session.leftovers import scan_with_leftovers
+    from hil.whole_file import write_whole
 
     url = port_url(port)
     bauds = tuple(baud or BAUD_RATES)
@@ -52,7 +52,7 @@ def init(
     terminal.say(said)
     text = arm_toml(replace(answers, measured=found))
     parse_config(text, out)
-    write_text(out, text)
+    write_whole(out, text)
     print(f"Wrote {out}. Read it, then type the next command.\n{next_step('check', out)}")
 
 

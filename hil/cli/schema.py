@@ -15,10 +15,10 @@ def schema(
     FILE`.
     """
     from hil.config.json_schema import schema_text
-    from hil.export.source import write_text
+    from hil.whole_file import write_whole
 
     if out is None:
         print(schema_text(), end="")
         return
-    write_text(out, schema_text())
+    write_whole(out, schema_text())
     print(f"Wrote {out}. Make this the first line of a TOML file in the same folder: #:schema ./{out.name}")

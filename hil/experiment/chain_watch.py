@@ -58,7 +58,8 @@ class ChainWatch:
     """Checks every sample against the model.
 
     planned: largest goal of each joint [A, or V in PWM mode]. arms: prior knowledge of the arm; by default, from the
-    configuration. interval, explain: as for `ModelWatch`.
+    configuration. interval, explain: as for `ModelWatch`. has_moved: whether the arm has moved as described in an
+    earlier run, so that a message names the description last.
     """
 
     def __init__(
@@ -68,8 +69,11 @@ class ChainWatch:
         arms: ChainArms | None = None,
         interval: float | None = None,
         explain: Explain = lambda *_: None,
+        *,
+        has_moved: bool = False,
     ) -> None:
         self._explain = explain
+        self._has_moved = has_moved
         arms = prior_arms(config, known_chain(config), ARMS) if arms is None else arms
         self._constants = np.array([joint.torque_per_goal for joint in config.joints])
         mean, covariance = observed_parameters(arms)
@@ -157,15 +161,23 @@ class ChainWatch:
             )
             blocked_by = self._blocked_by[joint]
             against_stop = "" if self._was_below[joint] or self._was_above[joint] else _AGAINST_STOP
-            causes = f"{_DOUBTS}{against_stop} Otherwise, {blocked_by[0].lower()}{blocked_by[1:]}"
+            causes = self._ordered(f"{_DOUBTS}{against_stop}", blocked_by)
         else:
             self._explain(joint, float(lacking), [state for state, _ in self._commanded])
             said = (
                 f"{name} {UNLIKE_ANY_ARM} consistent with the prior and the data so far: "
                 f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion."
             )
-            causes = f"{_DOUBTS} Otherwise, its motor or its encoder has failed, or something is pushing or holding it."
+            failed = "Its motor or its encoder has failed, or something is pushing or holding it."
+            causes = self._ordered(_DOUBTS, failed)
         raise SafetyStop(said, Cause.UNEXPECTED, causes)
+
+    def _ordered(self, doubts: str, failed: str) -> str:
+        """Combine doubts about the description with causes in the arm itself, the likelier ones first."""
+        first, link, second = doubts, "Otherwise, ", failed
+        if self._has_moved:
+            first, link, second = failed, "If none of this applies: ", doubts
+        return f"{first} {link}{second[0].lower()}{second[1:]}"
 
 
 def observed_parameters(arms: ChainArms) -> tuple[Array, Array]:

@@ -180,7 +180,7 @@ def _play(
         if not has_moved():
             doubt_description(error, recorder.samples)
         with suppress(Exception):  # a failing hint must not hide what stopped the arm, or its torque state
-            doubt_spatial_description(config, error, recorder.samples)
+            doubt_spatial_description(config, error, recorder.samples, has_moved=has_moved())
         if isinstance(error, DriverError | HilError):
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):

@@ -119,7 +119,8 @@ class Stream:
             ModelWatch(config, planned, arms, apart, self._guard.look_at_supply)
             if not isinstance(arms, ChainArms) and not config.is_chain
             else ChainWatch(
-                config, planned, arms if isinstance(arms, ChainArms) else None, apart, self._guard.look_at_supply
+                *(config, planned, arms if isinstance(arms, ChainArms) else None, apart, self._guard.look_at_supply),
+                has_moved=self._left_by_a_run,
             )
         )
         self._way_down: WayDown | None = None

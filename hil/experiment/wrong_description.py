@@ -24,17 +24,21 @@ CONTRADICTS = frozenset({Cause.UNEXPECTED, Cause.WRONG_SIGN})
 """A stop for one of these reasons means that the motion contradicts the description."""
 
 
-def doubt_spatial_description(config: Config, error: BaseException, samples: NDArray[np.void]) -> None:
+def doubt_spatial_description(
+    config: Config, error: BaseException, samples: NDArray[np.void], *, has_moved: bool
+) -> None:
     """If the guard stopped a spatial arm because its motion contradicts the description, name the changes to the
     description that would explain the motion.
 
-    samples: all samples of the run.
+    samples: all samples of the run. has_moved: whether the arm has moved as described in an earlier run, so that the
+    description is doubted only if a change explains the motion.
     """
     stop = error if isinstance(error, SafetyStop) else error.__context__
     if not config.is_chain or not isinstance(stop, SafetyStop) or stop.overruled or stop.cause not in CONTRADICTS:
         return
-    stop.doubts_description = True
-    if changes := likely_mistakes(config, samples):
+    changes = likely_mistakes(config, samples)
+    stop.doubts_description = bool(changes) or not has_moved
+    if changes:
         said = ", or ".join(_said(config, each) for each in changes)
         stop.replace_remedy(
             f"The arm's whole motion contradicts its description, but would agree with it {said}. Compare the arm with "

@@ -20,8 +20,9 @@ from hil.estimator.chain.model.tilt import TILT
 from hil.export.actuators import add_actuators
 from hil.export.chain_links import ChainLinks, chain_links, without_movable
 from hil.export.left_out import base_orientation, chain_left_out, torque_constants
-from hil.export.source import Source, write_text
+from hil.export.source import Source
 from hil.export.xml_text import comment, numbers, to_text
+from hil.whole_file import write_whole
 
 _IN_MJCF = ("offset", "lag", "lag_ratio", *TILT)
 
@@ -63,7 +64,7 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
     left = [*found.left_out, *base_orientation(model), *rotors, *reduced]
     left += [*chain_left_out(model), *torque_constants(model)]
     _describe(root, model, found, left)
-    write_text(path, to_text(root))
+    write_whole(path, to_text(root))
     return left
 
 
@@ -92,7 +93,7 @@ def _export_own_urdf(found: ChainLinks, model: ChainArmModel, path: Path) -> lis
         friction = {"damping": f"viscous_{index + 1}", "friction": f"coulomb_{index + 1}"}
         ET.SubElement(element, "dynamics", {key: numbers(model.values[name]) for key, name in friction.items()})
         parent = joint.link
-    write_text(path, to_text(root))
+    write_whole(path, to_text(root))
     return left
 
 
@@ -133,7 +134,7 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
         ET.SubElement(parent, "inertial", pos=numbers(*body.centre), mass=numbers(body.mass), fullinertia=full)
         _add_geoms(parent, [solid for solid in solids if solid.link == number])
     add_actuators(root, model)
-    write_text(path, to_text(root))
+    write_whole(path, to_text(root))
     return left
 
 

@@ -9,8 +9,9 @@ from hil.export.actuators import add_actuators
 from hil.export.chain_files import export_chain_mjcf
 from hil.export.left_out import left_out
 from hil.export.mass_distribution import LinkMass, distribute
-from hil.export.source import Source, write_text
+from hil.export.source import Source
 from hil.export.xml_text import axis, describe, numbers, to_text
+from hil.whole_file import write_whole
 
 _CARRIED = ("armature", "offset", "lag", "cable_stiffness")
 
@@ -34,7 +35,7 @@ def export_mjcf(source: Source, path: Path) -> list[str]:
         parent = _add_body(parent, model, index, link, along)
         along = link.length
     add_actuators(root, model)
-    write_text(path, to_text(root))
+    write_whole(path, to_text(root))
     return left
 
 

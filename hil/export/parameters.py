@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from hil import strict_json
-from hil.export.source import Source, write_text
+from hil.export.source import Source
+from hil.whole_file import write_whole
 
 _KEPT = (
     "schema",
@@ -24,7 +25,7 @@ _KEPT = (
 
 def export_json(source: Source, path: Path) -> list[str]:
     """Write `path`; return an empty list, since nothing is left out."""
-    write_text(path, strict_json.dumps(_kept(source), indent=2) + "\n")
+    write_whole(path, strict_json.dumps(_kept(source), indent=2) + "\n")
     return []
 
 
@@ -32,7 +33,7 @@ def export_toml(source: Source, path: Path) -> list[str]:
     """Write `path`; return an empty list, since nothing is left out."""
     lines = ["# Base parameters of an identified arm [SI]; equations in docs/model.md. Read it with hil.load_model."]
     _write_table(lines, (), _kept(source))
-    write_text(path, "\n".join(lines) + "\n")
+    write_whole(path, "\n".join(lines) + "\n")
     return []
 
 

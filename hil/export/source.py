@@ -17,7 +17,7 @@ from hil.model_file import model_of, read_usable_result
 from hil.results.result import Result
 from hil.runs.run_folder import RunFolder
 
-__all__ = ["MissingPackages", "Recorded", "Source", "write_text"]
+__all__ = ["MissingPackages", "Recorded", "Source"]
 
 
 class MissingPackages(ExportError):
@@ -94,17 +94,3 @@ class Recorded:
             return datetime.fromisoformat(json.loads(path.read_text(encoding="utf-8"))["started"]).timestamp()
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise RunFolderError(f"{path} cannot be read: {error!r}.") from error
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file completely or not at all. Raises RunFolderError."""
-    if path.is_dir():
-        raise RunFolderError(f"{path} is a folder: give the name of the file to write.")
-    if not path.parent.is_dir():
-        raise RunFolderError(f"{path} cannot be written: the folder {path.parent} does not exist. Create it first.")
-    temporary = path.with_name(path.name + ".partial")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error

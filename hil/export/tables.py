@@ -8,8 +8,9 @@ import numpy as np
 
 from hil.errors import RunFolderError
 from hil.export.columns import columns, unit
-from hil.export.source import MissingPackages, Recorded, write_text
+from hil.export.source import MissingPackages, Recorded
 from hil.model_file import model_of
+from hil.whole_file import write_whole
 
 
 def export_csv(source: Recorded, path: Path) -> list[str]:
@@ -19,7 +20,7 @@ def export_csv(source: Recorded, path: Path) -> list[str]:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(table)
     writer.writerows(zip(*(column.tolist() for column in table.values()), strict=True))
-    write_text(path, text.getvalue())
+    write_whole(path, text.getvalue())
     return [
         "the identified parameters (a CSV file holds a single table; export them to TOML or JSON)",
         "units (SI, temperature in degrees C)",

@@ -8,8 +8,9 @@ from hil.chain_model import ChainArmModel
 from hil.export.chain_files import export_chain_urdf
 from hil.export.left_out import left_out, torque_constants
 from hil.export.mass_distribution import LinkMass, distribute
-from hil.export.source import Source, write_text
+from hil.export.source import Source
 from hil.export.xml_text import axis, describe, numbers, to_text
+from hil.whole_file import write_whole
 
 STANDARD_GRAVITY = 9.81
 
@@ -31,7 +32,7 @@ def export_urdf(source: Source, path: Path) -> list[str]:
     for index, link in enumerate(links):
         _add_link(root, index + 1, link)
         _add_joint(root, model, index, links[index - 1].length if index else 0.0)
-    write_text(path, to_text(root))
+    write_whole(path, to_text(root))
     return left
 
 

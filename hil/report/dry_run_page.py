@@ -9,9 +9,10 @@ from hil.config.schema import Config
 from hil.dry_run.chain_summary import ChainDryRun, chain_dry_run_lines
 from hil.dry_run.prediction import Prediction, quantities_of
 from hil.dry_run.summary import DryRun, dry_run_lines
-from hil.report.page import render, write_page
+from hil.report.page import render
 from hil.report.scene import planar_motion, spatial_motion
 from hil.report.section import Motion, Section, SpatialMotion, Table
+from hil.whole_file import write_whole
 
 
 def write_dry_run_page(config: Config, found: DryRun | ChainDryRun, path: Path) -> None:
@@ -27,7 +28,7 @@ def write_dry_run_page(config: Config, found: DryRun | ChainDryRun, path: Path) 
         Section("peaks", "Predicted peaks", tables=(_peaks(config, shown),)),
     )
     page = render(config.path.stem, datetime.now().isoformat(), sections, f"Dry run on {found.arms} simulated arms")
-    write_page(page, path)
+    write_whole(path, page)
 
 
 def _in_space(found: ChainDryRun) -> SpatialMotion | None:

@@ -12,7 +12,6 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup, escape
 
 from hil import __version__
-from hil.errors import RunFolderError
 from hil.report.chart import Chart, Figure
 from hil.report.run_data import RunData
 from hil.report.section import Section
@@ -30,6 +29,7 @@ from hil.report.sections.steps import steps
 from hil.report.sections.timing import timing
 from hil.report.sections.verdict import verdict
 from hil.report.svg import NARROW, WIDE, draw_svg
+from hil.whole_file import write_whole
 
 FILE_NAME = "report.html"
 MOST_POINTS = 70_000
@@ -59,19 +59,7 @@ SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
 
 def write_report(data: RunData, path: Path) -> None:
     """Write the report of a run; raises RunFolderError when it cannot be written."""
-    write_page(make_page(data), path)
-
-
-def write_page(page: str, path: Path) -> None:
-    """Write a page completely or not at all; raises RunFolderError."""
-    if path.is_dir():
-        raise RunFolderError(f"{path} is a folder: give the name of the file to write.")
-    temporary = path.with_name(path.name + ".partial")
-    try:
-        temporary.write_text(page, encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+    write_whole(path, make_page(data))
 
 
 def make_page(data: RunData) -> str:

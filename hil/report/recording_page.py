@@ -8,7 +8,7 @@ import numpy as np
 from hil.arm_model import ArmModel
 from hil.model_file import model_of, read_usable_result
 from hil.report.chart import BLUE, GREEN, ORANGE, Chart, Figure, Series, thin
-from hil.report.page import FILE_NAME, figures_in, render, write_page
+from hil.report.page import FILE_NAME, figures_in, render
 from hil.report.section import Folded, Picture, Section, Table
 from hil.report.sections.correlation import correlation_of
 from hil.report.sections.friction import friction_curve, friction_interval, model_curve
@@ -17,6 +17,7 @@ from hil.report.sections.verdict import TITLES
 from hil.report.words import percent
 from hil.results.result import Result, ShootingResult
 from hil.runs.recording_folder import Predicted, RecordingRecord, load_record, load_recordings
+from hil.whole_file import write_whole
 
 MOST_POINTS = 3000
 _CURVE = 401
@@ -39,7 +40,7 @@ def write_recording_report(folder: Path, out: Path | None = None) -> Path:
     shown = _load(folder)
     title = Path(shown.record.config or shown.record.files[0].path).stem
     path = out or folder / FILE_NAME
-    write_page(render(title, shown.record.started, _sections(shown)), path)
+    write_whole(path, render(title, shown.record.started, _sections(shown)))
     return path
 
 

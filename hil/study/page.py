@@ -8,9 +8,9 @@ import pyarrow as pa
 from jinja2 import Environment, StrictUndefined
 
 from hil import __version__
-from hil.errors import RunFolderError
 from hil.study.figures import QUANTILES, Figures, figures
 from hil.study.fleet import UNLIKE, fleets
+from hil.whole_file import write_whole
 
 FILE_NAME = "study.html"
 _BINS = 24
@@ -38,10 +38,7 @@ def write_page(table: pa.Table, title: str, path: Path) -> Figures:
         version=__version__,
         bar=100 / _BINS,
     )
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+    write_whole(path, text)
     return found
 
 

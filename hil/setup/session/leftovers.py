@@ -40,7 +40,7 @@ class Leftovers:
 
     told: str
     restore: str = ""
-    trouble: str = "settings not restored after a killed run"
+    trouble: str = "settings not restored after an earlier run"
 
     def __str__(self) -> str:
         fix = f" To switch its torque off and restore its settings, type: {self.restore}"

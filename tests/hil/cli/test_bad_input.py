@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import stat
@@ -76,6 +77,7 @@ FILES: dict[str, bytes] = {
     "kilohertz.toml": ARM.replace("rate = 400.0", "rate = 0.4").encode(),
     "long.toml": ARM.replace("period = 10.0", "period = 10000").encode(),
     "watch.toml": (ARM + "\n[safety]\nwatchdog = 80\n").encode(),
+    "date.toml": re.sub(r"(?m)^period = \S+", "period = 2026-11-28", ARM).encode(),
     "ratio.toml": ARM.replace("gear_ratio = 353.5", 'gear_ratio = "353:1"', 1).encode(),
     "fakemm.toml": ARM.replace("length = 0.147", "length = 147.0", 1).encode(),
     "milliamperes.toml": ARM.replace("current_limit = 1.2", "current_limit = 1200", 1).encode(),
@@ -309,6 +311,7 @@ CASES: list[tuple[str, int, str]] = [
     ("check kilohertz.toml", 2, "experiment.rate = 0.4: must be at least 20.0. If it is in kHz, write 400."),
     ("dry-run long.toml", 2, "experiment.period = 10000: must be at most 1000.0. If it is in ms, write 10."),
     ("check watch.toml", 2, "safety.watchdog = 80: must be at most 2.54. If it is in ms, write 0.08."),
+    ("check date.toml", 2, "experiment.period = 2026-11-28: must be a number"),
     ("check ratio.toml", 2, "fake.arm.drives[1].gear_ratio = '353:1': must be a number"),
     ("fake arm.toml --move 1:to=90", 2, "to = 90.0: must be at most 12.57. If it is in degrees, write 1.571."),
     ("fake fakemm.toml", 2, "fake.arm.links[1].length = 147.0: must be at most 3.0. If it is in mm, write 0.147"),

@@ -1,6 +1,7 @@
 """What the watch of a spatial arm judges, and what it does not."""
 
 import math
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -251,3 +252,20 @@ def test_what_is_said_of_a_joint_at_rest_and_of_one_that_moves(config: Config, w
     assert hardware.startswith("something is blocking it") and "encoder is frozen" in hardware
     with pytest.raises(SafetyStop, match=r"does not move like any arm .*: \+0\.250 N m"):
         sees(config, watch, interval * (last + 1), velocity=(-0.06, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_once_the_arm_has_moved_as_described_the_description_is_doubted_last(
+    config: Config, monkeypatch: pytest.MonkeyPatch, speed: float
+) -> None:
+    monkeypatch.setattr(chain_watch, "ChainObserver", Observer)
+    watch = ChainWatch(config, [0.5, 1.0, 2.0], cast(Any, TWO), has_moved=True)
+    interval = 1 / config.experiment.rate
+    for number in range(math.ceil(0.3 / interval) + 5):
+        sees(config, watch, interval * number, goal_current=(0.01 * number, 0.0, 0.0))
+    cast(Any, watch._observer).found = 0
+    with pytest.raises(SafetyStop) as stop:
+        sees(config, watch, interval * (number + 1), velocity=(speed, 0.0, 0.0))
+    hardware, described = str(stop.value).split(" If none of this applies: ")
+    assert "the arm may not be the one described" in described and "described" not in hardware.split("moving: ")[-1]
+    assert re.search("something is (blocking it|pushing or holding it)", hardware, re.IGNORECASE)

@@ -239,7 +239,7 @@ def test_scan_names_what_a_killed_run_left_and_the_command_that_restores_it(
     kill(config)
     before = bench.changed()
     out = scanned(config, capsys)
-    assert out.count("torque on; watchdog tripped; settings not restored after a killed run") == 2
+    assert out.count("torque on; watchdog tripped; settings not restored after an earlier run") == 2
     assert f"{config.path}) ended before it could restore this servo: its torque is still on, Operating Mode" in out
     assert out.splitlines()[-1] == f"Next: hil check {config.path}"
     assert bench.changed() == before and len(list(state_folder.glob("*.json"))) == 2, "nothing is written"
@@ -316,7 +316,7 @@ def test_a_process_killed_in_its_run_is_named_by_scan_and_restored_by_setup(
         assert f"hil check {real}" in " ".join(capsys.readouterr().out.split())
         assert hil("scan", link, "--baud", 1_000_000) == 0
         out = capsys.readouterr().out
-        assert "torque on; watchdog tripped; settings not restored after a killed run" in out
+        assert "torque on; watchdog tripped; settings not restored after an earlier run" in out
         assert out.splitlines()[-1] == f"Next: hil check {real}"
         assert hil("setup", link, "--id", 1) == 0
         with ServoBus.connect(load_config(real).bus) as bus:
