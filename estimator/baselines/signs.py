@@ -9,14 +9,15 @@ increases.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import permutations, product
 
 import numpy as np
 
+from hil.estimator.arrays import Array
 from hil.estimator.baselines.idim import InverseDynamics, fit_inverse_dynamics
 from hil.estimator.baselines.zero import turned_zeros
 from hil.estimator.data.recording import Recording
-from hil.estimator.errors import EstimationError
+from hil.estimator.errors import EstimationError, RecordingError
 
 CUTOFF = 8.0  # Hz
 COULOMB_WIDTH = 0.05  # rad/s
@@ -30,6 +31,9 @@ multiple of the residual with the signs as given, provided that it explains most
 
 MOST_LEFT = 0.5
 QUARTERS = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)  # rad; angles to try between the zero directions of two joints
+
+ANGLE_UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "turns": 2.0 * np.pi}
+"""Units that may be mistaken for each other [rad]."""
 
 _POSITIVE = ("inertia", "viscous", "coulomb")
 _STANDARD_ERRORS = 3.0
@@ -100,19 +104,22 @@ class Suspicion:
     """Parameters that are significantly negative with the signs as given."""
 
 
-def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
+def suspect_signs(recordings: Sequence[Recording], unknown_zeros: bool = False) -> Suspicion | None:
     """Return the reversal that explains the recordings much better than the given signs.
+
+    unknown_zeros: whether the zeros are not known, so that they are estimated anew for each combination of signs.
 
     Returns None if there is no such reversal or if filtered inverse dynamics cannot be solved.
     """
     joints = recordings[0].joints
-    given = _fit(recordings, Signs((1,) * joints, (1,) * joints))
+    fit = _fit_unzeroed if unknown_zeros else _fit
+    given = fit(recordings, Signs((1,) * joints, (1,) * joints))
     if given is None:
         return None
     impossible, left = _impossible(given), float(given.relative_residual.max())
     best: tuple[float, Signs] | None = None
     for signs in _combinations(joints):
-        fitted = _fit(recordings, signs)
+        fitted = fit(recordings, signs)
         if fitted is None or _impossible(fitted):
             continue
         residual = float(fitted.relative_residual.max())
@@ -163,10 +170,9 @@ def suspect_absolute_unzeroed(recordings: Sequence[Recording]) -> Absolute | Non
     if recordings[0].joints != 2:
         return None
     apart = [_difference(each, 0.0) for each in recordings]
-    zeros = turned_zeros(apart)
-    if zeros is None:
+    if turned_zeros(apart) is None:
         return None
-    evidence = _better_explained(recordings, [replace(each, position=each.position + zeros[:, None]) for each in apart])
+    evidence = _better_explained(recordings, _zeroed(apart))
     return None if evidence is None else Absolute(*evidence, 0.0)
 
 
@@ -204,19 +210,66 @@ def suspect_order(recordings: Sequence[Recording], torques: bool = True) -> tupl
         )
         for each in recordings
     ]
-    zeros = turned_zeros(other)
-    if zeros is not None:
-        other = [replace(each, position=each.position + zeros[:, None]) for each in other]
-    return _better_explained(recordings, other)
+    return _better_explained(recordings, _zeroed(other))
 
 
-def _better_explained(recordings: Sequence[Recording], changed: Sequence[Recording]) -> tuple[float, float] | None:
+@dataclass(frozen=True)
+class OtherUnit:
+    """A unit of the angles that explains the recordings much better than the stated one.
+
+    residual, residual_given: relative RMS of the worst joint's torque residual, with this unit and with the stated one.
+    """
+
+    stated: str
+    true: str
+    residual: float
+    residual_given: float
+
+
+def suspect_unit(recordings: Sequence[Recording], zero: Sequence[float] = ()) -> OtherUnit | None:
+    """Return evidence that all angles are in another unit than stated; None if that would not explain the recordings
+    much better.
+
+    zero: zeros [rad] that the angles include, by default 0.
+    """
+    zeros = np.zeros(recordings[0].joints) if not len(zero) else np.array(zero)
+    found = []
+    for (stated, given), (true, other) in permutations(ANGLE_UNITS.items(), 2):
+        try:
+            scaled = [_in_unit(each, zeros, other / given) for each in recordings]
+        except RecordingError:  # angles that no joint has
+            continue
+        # The filter biases friction if the motion is fast.
+        evidence = _better_explained(recordings, _zeroed(scaled), ("inertia",))
+        if evidence is not None:
+            found.append(OtherUnit(stated, true, *evidence))
+    return min(found, key=lambda each: each.residual, default=None)
+
+
+def _in_unit(recording: Recording, zeros: Array, factor: float) -> Recording:
+    position = factor * (recording.position - zeros[:, None]) + zeros[:, None]
+    return replace(recording, position=position, position_step=factor * recording.position_step)
+
+
+def _zeroed(recordings: Sequence[Recording]) -> Sequence[Recording]:
+    """Return the recordings with the zeros that gravity shows."""
+    zeros = turned_zeros(recordings)
+    if zeros is None:
+        return recordings
+    return [replace(each, position=each.position + zeros[:, None]) for each in recordings]
+
+
+def _better_explained(
+    recordings: Sequence[Recording], changed: Sequence[Recording], positive: tuple[str, ...] = _POSITIVE
+) -> tuple[float, float] | None:
     """Return the worst joint's relative RMS torque residual, first with the changed recordings, then with the given
     ones; None if the change does not explain them much better.
+
+    positive: kinds of parameters that must not be negative.
     """
-    as_given = Signs((1, 1), (1, 1))
+    as_given = Signs((1,) * recordings[0].joints, (1,) * recordings[0].joints)
     given, fitted = _fit(recordings, as_given), _fit(changed, as_given)
-    if given is None or fitted is None or _impossible(fitted):
+    if given is None or fitted is None or any(name.startswith(positive) for name in _impossible(fitted)):
         return None
     residual, left = float(fitted.relative_residual.max()), float(given.relative_residual.max())
     return (residual, left) if residual < LESS_RESIDUAL * left else None
@@ -246,6 +299,10 @@ def _fit(recordings: Sequence[Recording], signs: Signs) -> InverseDynamics | Non
         return fit_inverse_dynamics(with_signs(recordings, signs), CUTOFF, COULOMB_WIDTH)
     except EstimationError:
         return None
+
+
+def _fit_unzeroed(recordings: Sequence[Recording], signs: Signs) -> InverseDynamics | None:
+    return _fit(_zeroed(with_signs(recordings, signs)), Signs(*((1,) * len(signs.torque),) * 2))
 
 
 def _impossible(fitted: InverseDynamics) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ import numpy as np
 from hil.estimator import linalg
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.chain.model.base_parameters import BaseParameters
-from hil.estimator.chain.model.geometry import Chain
+from hil.estimator.chain.model.geometry import Chain, directions_of_gravity
 from hil.estimator.chain.simulation.motion_observer import STANDING, STATIC
 
 FILTER_S = 0.03  # time constant of each of the three poles
@@ -170,10 +170,8 @@ def _changes(chain: Chain, rest: Array) -> Iterator[Change]:
         for axis in np.eye(3):
             if abs(axis @ chain.axis[joint]) < np.sqrt(0.5):
                 yield Change(joint, "axis", axis=_tuple(axis))
-    weight = float(np.linalg.norm(chain.gravity))
-    for up in (*np.eye(3), *-np.eye(3)) if weight > 0.0 else ():
-        if -up @ chain.gravity < np.sqrt(0.5) * weight:
-            yield Change(-1, "base", axis=_tuple(up))
+    for gravity in directions_of_gravity(chain.gravity):
+        yield Change(-1, "base", axis=_tuple(-gravity / np.linalg.norm(gravity)))
 
 
 def _tuple(vector: Array) -> tuple[float, float, float]:

@@ -115,7 +115,7 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
     for recording in recordings:
         if recording.joints != model.joints:
             raise ModelError(f"the model has {model.joints} joints but a recording has {recording.joints}")
-    value, std, cutoff = _regression(recordings, model, prior)
+    value, std, cutoff = regression(recordings, model, prior)
     count = model.base.count
     if any(recording.between != "held" for recording in recordings):
         nothing = np.full(model.joints, np.nan)
@@ -133,8 +133,7 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
             _from_prior(model, std[:count], prior),
         )
     pieces = [MotionPiece.of(recording) for recording in recordings]
-    Y, torque = filtered_torques(recordings, model, cutoff, LAG)
-    left = _relative(torque - Y @ value, torque)
+    left = relative_residual(recordings, model, value, cutoff)
     linear = ChainLinear(value, std, LAG, tuple(map(_beginning, pieces)), left)
     fit = fit_periods(pieces, model, linear, prior)
     squares = [np.square(piece.position - found) for piece, found in zip(pieces, fit.positions, strict=True)]
@@ -185,13 +184,22 @@ def torque_error(recordings: Sequence[Recording], found: RecordedChain) -> Array
     return np.where(moves < MOVES, np.nan, _relative(error, torque))
 
 
-def _regression(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> tuple[Array, Array, float]:
+def regression(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> tuple[Array, Array, float]:
+    """Return the values of `ChainModel.linear_names`, their standard errors assuming a white residual [SI], and the
+    cut-off frequency [Hz]. Raises RecordingError if a recording cannot be filtered.
+    """
     for cutoff in CUTOFFS[:-1]:
         try:
             return (*fit_filtered(recordings, model, prior, cutoff, LAG), cutoff)
         except RecordingError:
             continue
     return (*fit_filtered(recordings, model, prior, CUTOFFS[-1], LAG), CUTOFFS[-1])
+
+
+def relative_residual(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> Array:
+    """Return the RMS of the regression's torque residual relative to that of the torque (joints,)."""
+    Y, torque = filtered_torques(recordings, model, cutoff, LAG)
+    return _relative(torque - Y @ value, torque)
 
 
 def _repeated(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> float:

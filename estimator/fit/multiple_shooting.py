@@ -114,6 +114,7 @@ class Shooting:
         torque = float(np.sqrt(np.mean([np.mean(recording.torque**2) for recording in recordings])))
         self.state_scale = np.repeat([options.angle_scale, velocity], model.joints).reshape(2, -1)
         self._scales = (torque, velocity)
+        self.speeds = np.max([np.abs(segment.state[1]) for segment in self.segments], axis=0)
         self._model = model
         self._trust = np.ones((len(self.segments), model.joints))
         self._driven: dict[tuple[float, ...], list[tuple[Array, Array]]] = {}
@@ -336,6 +337,9 @@ def estimate_by_shooting(
     problem = posed(1.0, None, options.max_step)
     problem.weight_as(coarse)
     found = _fit(problem, coordinates, found.shared, found.own, options.ftol, options)
+    sharp = coordinates.without_wide_steps(found.shared, problem.speeds)
+    if not np.array_equal(sharp, found.shared):
+        found = _fit(problem, coordinates, sharp, found.own, options.ftol, options)
     return replace(_estimate(problem, coordinates, model, found, length, options.angle_scale), fitted=of)
 
 

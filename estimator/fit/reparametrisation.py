@@ -122,6 +122,24 @@ class Coordinates:
                 changed[rise], changed[index] = np.log(LEAST_RISE), np.log(term_of(name).initial)
         return changed
 
+    def without_wide_steps(self, x: Array, speeds: Array) -> Array:
+        """Return `x` with Coulomb steps too wide for the motion converted to viscous friction; `x` may have further
+        coordinates.
+
+        Such a step has the same effect as viscous friction, so neither could be determined.
+
+        speeds: highest speed of each joint (joints,) [rad/s].
+        """
+        changed, value = x.copy(), self.values(x[: len(self.names)])
+        for index, (name, most) in enumerate(zip(self.names, highest_values(self.names, speeds), strict=True)):
+            if kind_of(name) != "coulomb_width" or value[index] <= most:
+                continue
+            viscous, coulomb = (self.names.index(f"{kind}_{joint_of(name)}") for kind in ("viscous", "coulomb"))
+            changed[viscous] += np.log1p(value[coulomb] / value[index] / value[viscous])
+            changed[coulomb] = np.log(self.options.min_initial * self.scales[coulomb])
+            changed[index] = np.log(self.scales[index])
+        return changed
+
     def slopes(self, x: Array) -> Array:
         """Return the derivatives of the parameters with respect to the coordinates (parameters, parameters) at `x`."""
         value = self.values(x)

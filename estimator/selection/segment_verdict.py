@@ -9,8 +9,9 @@ from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.models.conflicts import Conflict, Trust, conflict_sentences, contradicted, lowered
-from hil.estimator.models.terms import joint_of, kind_of
+from hil.estimator.models.terms import kind_of
 from hil.estimator.selection.candidates import Candidate
+from hil.estimator.selection.validation import relative_errors
 from hil.estimator.selection.verdict import (
     EXPLAINED,
     GOOD_PREDICTION,
@@ -33,7 +34,6 @@ AT_BOUND = (
     "may be far too small"
 )
 EXPLAINED_PREDICTION = 0.15  # prediction error above which even a nearly explained motion is not trusted
-LITTLE_TORQUE = 0.1  # fraction of the RMS torque; gravity torques below this are negligible
 IMPROVEMENT = {
     "inertia": "faster motion",
     "coupling": "faster motion of both joints together",
@@ -73,22 +73,10 @@ class SegmentEvidence:
 
 
 def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool = True) -> dict[str, float]:
-    """Return the relative standard error of each base parameter except offsets and, without gravity, gravity torques.
-
-    A parameter may be zero, such as the dry friction of an ideal joint. If the torque due to a parameter is negligible,
-    its error is relative to the fraction LITTLE_TORQUE of the RMS torque.
-    """
-    torque = LITTLE_TORQUE * np.sqrt(np.mean([np.mean(each.torque**2, axis=1) for each in recordings], axis=0))
+    """Return the relative standard error of each base parameter; see `relative_errors`."""
+    torque = np.sqrt(np.mean([np.mean(each.torque**2, axis=1) for each in recordings], axis=0))
     speed = np.sqrt(np.mean([np.mean(_velocity(each) ** 2, axis=1) for each in recordings], axis=0))
-    relative = {}
-    for name, value, std in zip(estimate.model.base_names, estimate.value, estimate.std, strict=False):
-        kind, joint = kind_of(name), (joint_of(name) or 1) - 1
-        if kind != "offset" and (gravity or kind != "gravity"):
-            least = float(torque[joint]) if kind in {"gravity", "coulomb"} else 0.0
-            least = float(torque[joint] / max(speed[joint], 1e-9)) if kind == "viscous" else least
-            size = max(abs(float(value)), least)
-            relative[name] = float(std) / size if size else np.inf
-    return relative
+    return relative_errors(estimate.model.base_names, estimate.value, estimate.std, torque, speed, gravity)
 
 
 def _velocity(recording: Recording) -> Array:

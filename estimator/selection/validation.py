@@ -16,7 +16,7 @@ from hil.estimator.models.terms import joint_of, kind_of
 from hil.estimator.selection.distortion import Distortion, distortion, excited_lines
 
 LAGS = 100
-LITTLE_TORQUE = 0.1  # fraction of the RMS torque; gravity torques below this are negligible
+LITTLE_TORQUE = 0.1  # fraction of the RMS torque below which the torque due to a parameter is negligible
 
 
 @dataclass(frozen=True)
@@ -87,27 +87,47 @@ def validate(period: SettledPeriod, estimate: Estimate, gravity: bool = True) ->
         _free_run(period, estimate),
         float(linalg.cond(correlation)),
         (names[first], names[second], float(correlation[first, second])),
-        {name: part for name, part in _relative_std(period, estimate).items() if gravity or kind_of(name) != "gravity"},
+        relative_errors(names, estimate.value, estimate.std, *_rms(period), gravity),
         _torque_std(period, estimate),
         levels(period, estimate),
     )
 
 
-def _relative_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]:
-    """Return the relative standard error of each base parameter except offsets.
+def relative_errors(
+    names: tuple[str, ...], value: Array, std: Array, torque: Array, speed: Array, gravity: bool = True
+) -> dict[str, float]:
+    """Return the relative standard error of each base parameter except offsets and, without gravity, gravity torques.
 
-    On a horizontal arm, gravity may be zero; errors of gravity torques are then relative to the fraction LITTLE_TORQUE
-    of the RMS torque.
+    A parameter may be zero, such as the dry friction of an ideal joint or the weight of a horizontal arm. If the torque
+    due to a parameter is negligible, its error is relative to the value at which it would not be.
+
+    Args:
+        names: names of the base parameters.
+        value, std: their values and standard errors, optionally followed by those of other parameters [SI].
+        torque, speed: RMS torque and velocity of each joint (joints,) [SI].
+        gravity: whether gravity acts in the arm's plane.
     """
-    torque = LITTLE_TORQUE * np.sqrt(np.mean(period.torque**2, axis=1))
     relative = {}
-    for name, value, std in zip(estimate.model.base_names, estimate.value, estimate.std, strict=False):
-        if kind_of(name) == "offset":
+    for name, each, error in zip(names, map(float, value), map(float, std), strict=False):
+        kind, joint = kind_of(name), (joint_of(name) or 1) - 1
+        if kind == "offset" or (kind == "gravity" and not gravity):
             continue
-        least = float(torque[(joint_of(name) or 1) - 1]) if kind_of(name) == "gravity" else 0.0
-        size = max(abs(float(value)), least)
-        relative[name] = float(std) / size if size else np.inf
+        size = max(abs(each), _negligible(kind, LITTLE_TORQUE * float(torque[joint]), float(speed[joint])))
+        relative[name] = error / size if size else np.inf
     return relative
+
+
+def _negligible(kind: str, torque: float, speed: float) -> float:
+    """Return the value of a parameter that causes `torque`; 0 for inertias, whose torque depends on the motion."""
+    if kind == "viscous":
+        return torque / max(speed, 1e-9)
+    return torque if kind in {"gravity", "coulomb"} else 0.0
+
+
+def _rms(period: SettledPeriod) -> tuple[Array, Array]:
+    """Return the RMS torque and velocity of each joint (joints,) [SI]."""
+    velocity = np.gradient(period.filled(), 1.0 / period.rate, axis=1)
+    return np.sqrt(np.mean(period.torque**2, axis=1)), np.sqrt(np.mean(velocity**2, axis=1))
 
 
 def _torque_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]:

@@ -29,7 +29,7 @@ from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.model.tilt import TILT, tilt_between
-from hil.estimator.chain.mount import SURE, better_gravity, opposed_moments
+from hil.estimator.chain.mount import LIKELY, SURE, better_gravity, opposed_moments
 from hil.estimator.chain.simulation.prediction import predict
 from hil.estimator.models.bounds import bound_sentence
 from hil.estimator.models.conflicts import Trust, conflict_sentences, contradicted, lowered
@@ -271,10 +271,10 @@ def doubted_mount(
 ) -> MountDoubt | None:
     """Return the contradiction between the centres of mass and the description, if there is one."""
     arm, explained = described_arm(config), is_explained(estimate)
-    sure = SURE if gravity is None else 0.0
+    sure = SURE if gravity is None else LIKELY
     opposed = opposed_moments(estimate.names, estimate.value, estimate.std, known.prior, sure)
     if gravity is None:
-        return mass_on_the_other_side(arm, opposed, explained, mounts_tried=True)
+        return mass_on_the_other_side(arm, opposed, explained)
     return mounted_otherwise(arm, opposed, known.base.chain.gravity, gravity, explained)
 
 

@@ -31,7 +31,12 @@ class MountDoubt:
 
 
 def mounted_otherwise(
-    arm: ArmDescription, opposed: Sequence[Opposed], assumed: Array, gravity: Array, explained: bool
+    arm: ArmDescription,
+    opposed: Sequence[Opposed],
+    assumed: Array,
+    gravity: Array,
+    explained: bool,
+    is_run: bool = True,
 ) -> MountDoubt:
     """State that estimate and description agree if the base is mounted differently.
 
@@ -41,8 +46,10 @@ def mounted_otherwise(
         assumed: configured gravity in the base's frame (3,) [m/s^2].
         gravity: gravity for which estimate and description agree, in the same form; see `better_gravity`.
         explained: whether the model explains the motion.
+        is_run: whether the recording is a run, and not one made by another program.
     """
     base, before = mount_angles(gravity), mount_angles(assumed)
+    where = "run's config.toml" if is_run else "configuration"
     contradiction = _on_the_other_side(arm, opposed) if opposed else f"The recording contradicts {arm.path.name}."
     return MountDoubt(
         "with care" if explained else "no",
@@ -50,8 +57,8 @@ def mounted_otherwise(
             contradiction,
             f"The two agree if the base is mounted differently: {_mount_said(gravity)}, base = {base} under [arm]; the "
             f"configuration implies {before}, apart from a rotation about the vertical. Check how the arm is mounted, "
-            f"and correct base.{_same_as(arm, assumed, gravity)} The recording remains usable: after base has been "
-            "corrected in the run's config.toml, `hil estimate` suffices.",
+            f"and correct base.{_same_as(arm, assumed, gravity, is_run)} The recording remains usable: after base has "
+            f"been corrected in the {where}, `hil estimate` suffices.",
             _still_right(explained),
         ),
         f"set base = {base} under [arm], or correct what else is wrong (see the verdict)",
@@ -59,32 +66,34 @@ def mounted_otherwise(
 
 
 def mass_on_the_other_side(
-    arm: ArmDescription, opposed: Sequence[Opposed], explained: bool, mounts_tried: bool
+    arm: ArmDescription, opposed: Sequence[Opposed], explained: bool, is_run: bool = True
 ) -> MountDoubt | None:
     """State which moments contradict the description in sign, and what may be wrong; None if there are none.
 
-    mounts_tried: whether `better_gravity` has tried other directions of gravity.
+    is_run: whether the recording is a run, and not one made by another program.
     """
     if not opposed:
         return None
     joints = ", ".join(arm.joints[link - 1].name for link in sorted({each.link for each in opposed}))
-    tried = (
-        "Standing, hanging and wall mounts were tried in place of `base`, but none of them agrees better. "
-        if mounts_tried
-        else ""
-    )
+    zero, signs = _zero_key(is_run), "`direction`" if is_run else "the signs"
+    shown = " (`hil pose` shows the angles)" if is_run else ""
     return MountDoubt(
         "with care",
         (
             _on_the_other_side(arm, opposed),
-            f"{tried}Check, in this order: `base`, the orientation of the mount; `direction` and the axis of these "
-            "joints and of those before them; zero_ticks, which may be off by 90 or 180 degrees (`hil pose` shows the "
-            "angles); the centres of mass in the description.",
+            "Standing, hanging and wall mounts were tried in place of `base`, but none of them agrees better. Check, "
+            f"in this order: `base`, the orientation of the mount; {signs} and the axis of these joints and of those "
+            f"before them; {zero}, which may be off by 90 or 180 degrees{shown}; the centres of mass in the "
+            "description.",
             _still_right(explained),
         ),
-        f"check base, and direction and zero_ticks of {joints} (see the verdict); if all are right, the result can be "
-        "exported",
+        f"check base, and {signs.strip('`')} and {zero} of {joints} (see the verdict); if all are right, the result "
+        "can be exported",
     )
+
+
+def _zero_key(is_run: bool) -> str:
+    return "zero_ticks" if is_run else "columns.zero"
 
 
 def _on_the_other_side(arm: ArmDescription, opposed: Sequence[Opposed]) -> str:
@@ -110,7 +119,7 @@ def _mount_said(gravity: Array) -> str:
     return f"on a wall with its {'xy'[axis]} axis pointing {'down' if down[axis] > 0.0 else 'up'}"
 
 
-def _same_as(arm: ArmDescription, assumed: Array, gravity: Array) -> str:
+def _same_as(arm: ArmDescription, assumed: Array, gravity: Array, is_run: bool) -> str:
     """State that an encoder zero of the first joint would have the same effect, if it would."""
     first = arm.joints[0]
     axis = first.rotation @ first.axis
@@ -120,7 +129,7 @@ def _same_as(arm: ArmDescription, assumed: Array, gravity: Array) -> str:
     turned = math.degrees(math.acos(max(-1.0, min(1.0, float(before @ after)))))
     return (
         f" A zero of {first.name} that is off by {turned:.0f} degrees has the same effect: if base is right, correct "
-        f"zero_ticks of {first.name}."
+        f"{_zero_key(is_run)} of {first.name}."
     )
 
 

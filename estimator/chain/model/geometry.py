@@ -1,5 +1,6 @@
 """The geometry of a serial arm: the placement of its joints. Everything else is identified."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ LINK_TERMS = (
 """Inertial parameters of a link in its own frame: mass [kg], mass times centre of mass [kg m], inertia about the
 frame's origin [kg m^2].
 """
+SAME = 0.9  # cosine of the angle between two directions of gravity above which they count as the same
 UNITS = {"mass": "kg", "moment": "kg m", "inertia": "kg m^2", "armature": "kg m^2"}
 
 
@@ -63,6 +65,19 @@ class Chain:
         given = self.rotation, self.translation, self.axis, self.gravity
         rotation, translation, axis, gravity = (np.ascontiguousarray(each, dtype=np.float64) for each in given)
         return rotation, translation, axis, gravity
+
+
+def directions_of_gravity(assumed: Array) -> Iterator[Array]:
+    """Yield other directions that gravity may have in the base's frame (3,) [m/s^2]: reversed, then along its axes.
+
+    assumed: gravity as described (3,) [m/s^2]; without gravity, nothing is yielded.
+    """
+    size = float(np.linalg.norm(assumed))
+    tried = [assumed]
+    for each in (-assumed, *(-size * np.eye(3)), *(size * np.eye(3))):
+        if all(float(each @ other) < SAME * size**2 for other in tried):
+            tried.append(each)
+            yield each
 
 
 def parameter_names(joints: int) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
 from hil.estimation.chain_estimate import chain_facts, stopped_short, vague
-from hil.estimation.chain_mount import mass_on_the_other_side
+from hil.estimation.chain_mount import MountDoubt, mass_on_the_other_side, mounted_otherwise
 from hil.estimation.slips.sticking import sticking_joints
 from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
 from hil.estimation.unsettled.chain_slips import late_torque, refuse_chain_slips, torques_apart
@@ -25,7 +25,7 @@ from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel, Drive
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.prior import Prior
-from hil.estimator.chain.mount import opposed_moments
+from hil.estimator.chain.mount import LIKELY, SURE, better_gravity_recorded, opposed_moments
 from hil.estimator.chain.recordings import MotionPiece, RecordedChain, identify_recordings, torque_error
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
@@ -79,7 +79,8 @@ def estimate_chain_recordings(
         by_voltage=tuple(range(1, base.chain.joints + 1)) if config.columns.drive in {"voltage", "pwm"} else (),
     )
     check = ColumnCheck.of(recordings, ChainModel(base), prior)
-    refuse_chain_slips(check, config.joint_names or (), source)
+    mounted = better_gravity_recorded(recordings, model, arm.parameters)
+    refuse_chain_slips(check, config.joint_names or (), source, mounted)
     names = [joint.name for joint in arm.joints]
     late = late_torque(check, names, all(each.between == "held" for each in recordings))
     contradictory = () if model.torque_scale or late else torques_apart(check, names)
@@ -108,7 +109,16 @@ def estimate_chain_recordings(
         validation=Validation(
             residual_over_floor=tuple(found.residual_over_noise.tolist()) if found.simulated else None
         ),
-        verdict=_verdict(found, arm, foretold, prior, contradictory, late, _sticking(recordings)),
+        verdict=_verdict(
+            found,
+            arm,
+            foretold,
+            prior,
+            contradictory,
+            late,
+            _sticking(recordings),
+            None if mounted is None else mounted.gravity,
+        ),
         warnings=doubted_inertias(arm),
         timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),
         chain=chain_facts(arm, base, found.from_prior),
@@ -211,11 +221,12 @@ def _verdict(
     contradictory: Sequence[str] = (),
     late: Sequence[str] = (),
     sticking: Sequence[int] = (),
+    gravity: Array | None = None,
 ) -> Verdict:
     """The verdict, with reasons.
 
     contradictory, late: sentences about torques that contradict each other in the regression, or are logged late.
-    sticking: joints that stick, from 0.
+    sticking: joints that stick, from 0. gravity: see `better_gravity_recorded`.
     """
     names = found.model.base.names
     weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
@@ -232,12 +243,10 @@ def _verdict(
         trust = trust if worst <= EXPLAINED else "with care"
         if found.systematic > SYSTEMATIC:
             trust = "with care"
-            lags = ', lags that differ by joint (model.drive = "delay_lag")' if found.model.drive == "delay" else ""
             sentences.append(
                 "Part of the residual repeats with the motion. This increases standard errors by a factor of up to "
-                f"{found.systematic:.1f}, and some values may be wrong by more than their standard errors. An effect "
-                "is missing from the model: torque ripple or cogging, play or elasticity of the gears, a cable, "
-                f"friction that depends on load or changes with time{lags}, or torques that differed from the commands."
+                f"{found.systematic:.1f}, and some values may be wrong by more than their standard errors. "
+                f"{_missing(found.model, gravity)}"
             )
     else:
         trust = "with care"
@@ -246,7 +255,7 @@ def _verdict(
             'partly systematic. If the columns hold commands, set columns.between = "held": maximum likelihood is then '
             "far more accurate."
         )
-    at_most, why = _judged_prediction(foretold, arm, explained)
+    at_most, why = _judged_prediction(foretold, arm, explained, gravity is not None)
     trust = lowered(trust, at_most)
     sentences += why
     if found.from_prior:
@@ -275,15 +284,41 @@ def _verdict(
         trust = lowered(trust, "with care")
         names_stuck = [arm.joints[joint].name for joint in sticking]
         sentences.append(stopped_short(names_stuck, "Record faster motion"))
-    opposed = opposed_moments(found.names, found.value, found.std, prior)
-    mount = mass_on_the_other_side(arm, opposed, explained, mounts_tried=False)
+    mount = _doubted_mount(found, arm, prior, gravity, explained)
     if mount is None:
         return Verdict(trust, weakest, tuple(sentences))
     return Verdict(lowered(trust, mount.at_most), weakest, (*sentences, *mount.said), mount.first)
 
 
-def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: bool) -> tuple[str, tuple[str, ...]]:
-    """The best verdict that the prediction of the last part allows ("" for any), and why."""
+def _doubted_mount(
+    found: RecordedChain, arm: ArmDescription, prior: Prior, gravity: Array | None, explained: bool
+) -> MountDoubt | None:
+    """Return the contradiction between the centres of mass and the description, if there is one."""
+    sure = SURE if gravity is None else LIKELY
+    opposed = opposed_moments(found.names, found.value, found.std, prior, sure)
+    if gravity is None:
+        return mass_on_the_other_side(arm, opposed, explained, is_run=False)
+    return mounted_otherwise(arm, opposed, found.model.base.chain.gravity, gravity, explained, is_run=False)
+
+
+def _missing(model: ChainModel, gravity: Array | None) -> str:
+    """Say why part of the motion is unexplained. gravity: see `better_gravity_recorded`."""
+    if gravity is not None:
+        return "The model is incomplete, probably because the arm is not mounted as configured."
+    lags = ', lags that differ by joint (model.drive = "delay_lag")' if model.drive == "delay" else ""
+    return (
+        "An effect is missing from the model: torque ripple or cogging, play or elasticity of the gears, a cable, "
+        f"friction that depends on load or changes with time{lags}, or torques that differed from the commands."
+    )
+
+
+def _judged_prediction(
+    foretold: Array | None, arm: ArmDescription, explained: bool, is_mount_known: bool = False
+) -> tuple[str, tuple[str, ...]]:
+    """The best verdict that the prediction of the last part allows ("" for any), and why.
+
+    is_mount_known: whether the verdict names another mount as the cause.
+    """
     if foretold is None:
         return "with care", (
             "The recordings are too short, or continue for too long after the motion has ended, to check the "
@@ -294,11 +329,12 @@ def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: b
     if error <= wrong:
         return "with care" if error > TORQUE_FORETOLD else "", (said,)
     unexplained = "" if explained else " together with an unexplained part of the motion"
-    return "no", (
-        said,
-        f'An error above {100 * wrong:.0f} %{unexplained} makes the verdict "no": check which column belongs to which '
-        "joint, the units and signs of the columns, whether the load changed, and the description of the arm.",
+    check = (
+        ": check which column belongs to which joint, the units and signs of the columns, whether the load changed, "
+        "and the description of the arm"
     )
+    check = "" if is_mount_known else check
+    return "no", (said, f'An error above {100 * wrong:.0f} %{unexplained} makes the verdict "no"{check}.')
 
 
 def _foretold_said(error: float, joint: str) -> str:

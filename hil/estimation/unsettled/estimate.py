@@ -137,7 +137,7 @@ def estimate_any(
     plain = estimate if choice is None else choice.plain
     fitted = Fitted(recordings, given.names, predicted, plain, estimate, gravity, given.repeats)
     why = () if given.jumps else causes(fitted)
-    found = doubts_of(recordings, estimate, are_known(fitted, why), gravity > 0.0)
+    found = doubts_of(recordings, estimate, are_known(fitted, why), gravity > 0.0, zeros and not given.zeros)
     verdict = _judged(fitted, given, why, held_out, found)
     result = _result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3), stepped)
     result = replace(
@@ -181,7 +181,7 @@ def _judged(fitted: Fitted, given: Given, why: tuple[str, ...], held_out: Array 
     )
     scales = () if spoiled else angle_scale(recordings, estimate, given.origin)
     lengths = () if spoiled else wrong_length(given.length, fitted.gravity, estimate)
-    odd = (*why, *scales, *contradictory, *lengths, *implausible(recordings, estimate, fitted.gravity))
+    odd = (*why, *scales, *contradictory, *lengths, *implausible(recordings, estimate, fitted.gravity, given.origin))
     return judge_segments(
         recordings,
         estimate,
@@ -192,7 +192,7 @@ def _judged(fitted: Fitted, given: Given, why: tuple[str, ...], held_out: Array 
             bool(found.faults),
             bool(found.doubts),
             conflicts_found,
-            tuple(undetermined(estimate)),
+            tuple(undetermined(recordings, estimate)),
             spoiled,
             () if why else ratios_said(joints, ratios, given.torque_source, contradictory),
             fitted.gravity > 0.0,

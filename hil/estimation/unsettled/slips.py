@@ -13,6 +13,7 @@ from hil.estimator.baselines.signs import (
     suspect_order,
     suspect_signs,
     suspect_swapped,
+    suspect_unit,
     with_signs,
 )
 from hil.estimator.baselines.zero import turned_zeros
@@ -38,7 +39,7 @@ def refuse_slips(
     zero: columns.zero, which the angles in the recordings already include; None if it is not known. zero_is_set:
     whether the user set it.
     """
-    _refuse_absolute(recordings, source, zero)
+    _refuse_absolute(recordings, source, zero, zero_is_set)
     order = suspect_order(recordings)
     if order is not None and _is_clear(*order):
         raise CsvError(
@@ -56,7 +57,9 @@ def refuse_slips(
                 f"{source}: the {column} columns of joints 1 and 2 seem to be swapped: with them exchanged, "
                 f"{unexplained(*swapped)}. Exchange them in the file, or in [columns] of --config ARM.toml."
             )
-    signs = suspect_signs(recordings)
+    signs = suspect_signs(recordings, not zero_is_set)
+    if signs is None or not _is_clear(signs.residual, signs.residual_given):
+        _refuse_units(recordings, source, zero)
     if signs is None:
         return
     if _is_clear(signs.residual, signs.residual_given):
@@ -72,6 +75,18 @@ def refuse_slips(
             f"{source}: {signs.signs.said()} {verb} reversed: as given, {' and '.join(inertias)} would be negative. "
             f"{_correction(recordings, signs.signs, zero if zero_is_set else None)}"
         )
+
+
+def _refuse_units(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None) -> None:
+    """Raise CsvError if the angles are in another unit than stated. zero: see `refuse_slips`."""
+    found = suspect_unit(recordings, zero or ())
+    if found is None or not _is_clear(found.residual, found.residual_given):
+        return
+    raise CsvError(
+        f"{source}: the angles were read as {found.stated} but seem to be in {found.true}: in {found.true}, "
+        f"{unexplained(found.residual, found.residual_given)}. Correct the unit in the headers of the columns, or set "
+        f'position_unit = "{found.true}" in [columns] of --config ARM.toml.'
+    )
 
 
 def _correction(recordings: Sequence[Recording], signs: Signs, zero: Sequence[float] | None) -> str:
@@ -105,17 +120,20 @@ def refuse_stuck(recordings: Sequence[Recording], source: str, segment: float) -
             )
 
 
-def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None) -> None:
+def _refuse_absolute(
+    recordings: Sequence[Recording], source: str, zero: Sequence[float] | None, zero_is_set: bool
+) -> None:
     """Raise CsvError if the angle of joint 2 is absolute; the message also gives the zero if that must change."""
     joints = recordings[0].joints
-    free = suspect_absolute_unzeroed(recordings) if zero is None else None
+    free = suspect_absolute_unzeroed(recordings) if zero is None or not zero_is_set else None
     zero = zero or (0.0,) * joints
     # columns.zero applies to the difference of the angles, but both zeros were added to the absolute angles.
     found = free or suspect_absolute(recordings, (zero[0], zero[0] - zero[-1]))
     if found is None or not _is_clear(found.residual, found.residual_given):
         return
     second = (zero[-1] + found.turned - zero[0] + math.pi) % (2.0 * math.pi) - math.pi
-    other = "" if abs(second - zero[-1]) < SAME_ANGLE else f" and zero = [{zero[0]:.4f}, {second:.4f}]"
+    is_same = abs(second - zero[-1]) < SAME_ANGLE or free is not None
+    other = "" if is_same else f" and zero = [{zero[0]:.4f}, {second:.4f}]"
     raise CsvError(
         f"{source}: the angle of joint 2 seems to be measured from a fixed direction, such as the horizontal, "
         f"instead of from link 1. With the difference between the two angles, "

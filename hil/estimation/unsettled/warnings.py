@@ -10,6 +10,7 @@ from hil.estimator.baselines.signs import suspect_signs
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.models.terms import kind_of
+from hil.estimator.selection.segment_verdict import relative_std
 from hil.estimator.selection.verdict import MUCH_LEFT
 
 LEAST_SWING = 30.0  # encoder steps
@@ -36,14 +37,18 @@ class Doubts:
 
 
 def doubts_of(
-    recordings: Sequence[Recording], estimate: ShootingEstimate, cause_known: bool = False, gravity: bool = True
+    recordings: Sequence[Recording],
+    estimate: ShootingEstimate,
+    cause_known: bool = False,
+    gravity: bool = True,
+    unknown_zeros: bool = False,
 ) -> Doubts:
     """Find signs of errors in the recordings, or in how the estimate explains them.
 
     cause_known: whether the verdict says why much of the motion is unexplained. gravity: whether gravity acts in the
-    arm's plane.
+    arm's plane. unknown_zeros: whether nobody has stated the zeros of the angles.
     """
-    faults, doubts, warnings = _signs(recordings), [], _rows(recordings)
+    faults, doubts, warnings = _signs(recordings, unknown_zeros), [], _rows(recordings)
     reasons = ["a sign is reversed (see the warning)"] if faults else []
     for joint in range(estimate.model.joints):
         name = f"Joint {joint + 1}"
@@ -64,8 +69,8 @@ def doubts_of(
     return Doubts(tuple(faults), tuple(doubts), shown, " and ".join(reasons))
 
 
-def _signs(recordings: Sequence[Recording]) -> list[str]:
-    suspicion = suspect_signs(recordings)
+def _signs(recordings: Sequence[Recording], unknown_zeros: bool) -> list[str]:
+    suspicion = suspect_signs(recordings, unknown_zeros)
     if suspicion is None:
         return []
     subject, several = suspicion.signs.said(), suspicion.signs.are_several
@@ -145,7 +150,8 @@ def _early(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[
 
 
 def _weak(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool) -> list[str]:
-    """Name the base parameters with a large relative error, except gravity torques known to be negligible."""
+    """Name the base parameters with a large relative error, except those whose torque is known to be negligible."""
+    relative = relative_std(recordings, estimate, gravity)
     count = len(estimate.model.base_names)
     known = zip(estimate.names[:count], estimate.value, estimate.std, strict=False)
     torque = float(np.sqrt(np.mean([np.mean(each.torque**2) for each in recordings])))
@@ -153,7 +159,7 @@ def _weak(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: 
     weak = [
         f"{name} ({100 * std / abs(value):.0f} %)" if std < UNSEEN * abs(value) else f"{name} (not at all)"
         for name, value, std in known
-        if std > WEAK * max(abs(value), least.get(kind_of(name), 0.0))
+        if std > WEAK * max(abs(value), least.get(kind_of(name), 0.0)) and relative.get(name, 0.0) > WEAK
     ]
     if not weak:
         return []

@@ -158,3 +158,44 @@ def test_joints_in_the_wrong_order_have_their_zeros_in_the_wrong_order() -> None
         refuse_slips([exchanged], "arm.csv", (0.0, 0.0))
     with pytest.raises(CsvError, match=r"of --config ARM\.toml\.$"):
         refuse_slips([exchanged], "arm.csv")
+
+
+@pytest.fixture(scope="module")
+def unzeroed() -> Recording:
+    """Angles with zeros that nobody knows."""
+    motion = two_joints(12.0)
+    position = motion.position + np.array([[0.9], [-1.1]])
+    return Recording(motion.time, motion.torque, position, np.full(2, 1.5e-3), "held")
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_an_angle_and_its_torque_reversed_are_named_together_if_the_zeros_are_unknown(
+    unzeroed: Recording, joint: int
+) -> None:
+    """Only the torque was named, since without the zeros nothing explained the motion."""
+    refuse_slips([unzeroed], "arm.csv", zero_is_set=False)
+    sign = (-1, 1) if joint == 0 else (1, -1)
+    said = "the signs of the torque of joint 2 and the position of joint 2 are reversed"
+    with pytest.raises(CsvError, match=said):
+        refuse_slips([turned(unzeroed, sign, sign)], "arm.csv", zero_is_set=False)
+    refuse_slips([turned(turned(unzeroed, sign, sign), (1, -1), (1, -1))], "arm.csv", zero_is_set=False)
+
+
+def test_exchanged_angles_with_unknown_zeros_are_named(unzeroed: Recording) -> None:
+    with pytest.raises(CsvError, match="the position columns of joints 1 and 2 seem to be swapped"):
+        refuse_slips([replace(unzeroed, position=unzeroed.position[::-1].copy())], "arm.csv", zero_is_set=False)
+
+
+def test_the_zero_of_joint_2_is_found_even_if_that_of_joint_1_is_right(unzeroed: Recording) -> None:
+    zeros = turned_zeros([replace(unzeroed, position=unzeroed.position + np.array([[-0.9], [0.0]]))])
+    assert zeros is not None
+    np.testing.assert_allclose(zeros, [0.0, 1.1], atol=0.1)
+
+
+@pytest.mark.parametrize(("stated", "true"), [("deg", "rad"), ("rad", "turns"), ("turns", "rad")])
+def test_angles_in_another_unit_are_named(stated: str, true: str) -> None:
+    motion, zero = two_joints(12.0), np.array([[0.4], [-0.3]])
+    factor = signs.ANGLE_UNITS[stated] / signs.ANGLE_UNITS[true]
+    given = Recording(motion.time, motion.torque, factor * (motion.position - zero) + zero, np.full(2, 1e-4), "held")
+    with pytest.raises(CsvError, match=f'read as {stated} but seem to be in {true}.*position_unit = "{true}"'):
+        refuse_slips([given], "arm.csv", (0.4, -0.3))

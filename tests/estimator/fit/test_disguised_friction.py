@@ -44,6 +44,18 @@ def test_a_rise_that_never_falls_becomes_coulomb_friction() -> None:
     assert np.array_equal(COORDINATES.undisguised(real), real)
 
 
+def test_a_coulomb_step_that_no_speed_completes_becomes_viscous_friction() -> None:
+    """Recordings of arms without dry friction determined neither."""
+    names = ("viscous_1", "coulomb_1", "coulomb_width_1")
+    coordinates = Coordinates(names, np.array([0.1, 0.1, 0.05]), CoordinateOptions(1e-4))
+    x = np.concatenate((coordinates.coordinates(np.array([0.02, 3.0, 1000.0])), [0.7]))
+    sharp = coordinates.without_wide_steps(x, np.array([TOP_SPEED]))
+    viscous, coulomb, width = coordinates.values(sharp[:3])
+    assert viscous == pytest.approx(0.023) and coulomb < 1e-3 and width < 0.1 and sharp[3] == 0.7
+    narrow = coordinates.coordinates(np.array([0.02, 0.1, 0.25 * TOP_SPEED]))
+    assert np.array_equal(coordinates.without_wide_steps(narrow, np.array([TOP_SPEED])), narrow)
+
+
 def test_a_rise_above_no_friction_stays_bounded() -> None:
     x = COORDINATES.coordinates(np.array([1e-9, 0.01, 1e7, 0.2]))
     for _ in range(12):

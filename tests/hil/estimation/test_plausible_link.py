@@ -50,3 +50,20 @@ def test_a_torque_without_gravity_is_named(gravity_2: tuple[float, float], named
     estimate: Any = SimpleNamespace(parameters=value, names=tuple(value), value=values, std=std)
     found = implausible([SimpleNamespace(joints=0)], estimate, 9.81)  # type: ignore[list-item]
     assert any("torque column does not include gravity" in said for said in found) is named
+
+
+@pytest.mark.parametrize(
+    ("weights", "zero"), [((-0.4, 0.1), "[-1.6708, 3.0916]"), ((0.4, -0.1), "[1.4708, 3.0916]"), ((0.4, 0.1), "")]
+)
+def test_the_zeros_that_make_the_weights_positive_are_named(weights: tuple[float, float], zero: str) -> None:
+    """The verdict called every wrong zero "half a turn off", even one that was off by a quarter."""
+    value = {"gravity_1": weights[0], "gravity_2": weights[1], "inertia_1": 0.02}
+    values = np.array(list(value.values()))
+    zeros = np.array([[-0.1, -0.25]])
+    estimate: Any = SimpleNamespace(
+        parameters=value, names=tuple(value), value=values, std=np.full(3, 1e-3), zeros=zeros
+    )
+    found = implausible([SimpleNamespace(joints=0)], estimate, 9.81, (np.pi / 2, 0.2))  # type: ignore[list-item]
+    said = " ".join(found)
+    assert ("the zero of an angle is wrong" in said) is bool(zero)
+    assert f"set zero = {zero} in [columns]" in said or not zero

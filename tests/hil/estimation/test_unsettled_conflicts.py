@@ -109,8 +109,10 @@ def test_the_verdict_gives_its_own_reason_and_no_infinite_uncertainty(spoiled: b
 
 
 def test_an_undetermined_term_is_listed_without_an_infinite_error() -> None:
-    estimate: Any = SimpleNamespace(names=("coulomb_width_1",), value=np.array([37.0]), std=np.array([np.inf]))
-    (said,) = undetermined(estimate)
+    names, value = ("coulomb_1", "coulomb_2", "coulomb_width_1"), np.array([1.0, 1.0, 37.0])
+    estimate: Any = SimpleNamespace(names=names, value=value, std=np.array([1e-3, 1e-3, np.inf]))
+    estimate.parameters = dict(zip(names, value.tolist(), strict=True))
+    (said,) = undetermined([RECORDING], estimate)
     assert "coulomb_width_1 (not at all)" in said
 
 

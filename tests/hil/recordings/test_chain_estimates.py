@@ -66,6 +66,7 @@ def test_commanded_torque_gives_the_likelihood(setup: bench.Setup, capsys: pytes
     assert max(found.fit.residual_rms_ticks) < 0.32
     assert found.verdict is not None
     assert found.verdict.trust == "yes"
+    assert "mounted" not in " ".join(found.verdict.sentences)
     model = api.load_model("commanded")
     assert model.values["lag"] == pytest.approx(1e-3, abs=1e-4)
     assert hil("export", "commanded", "--format", "urdf", "--out", "found.urdf") == 0
@@ -73,6 +74,19 @@ def test_commanded_torque_gives_the_likelihood(setup: bench.Setup, capsys: pytes
     assert hil("estimate", "commanded", "--json") == 0  # again, from what the folder keeps
     again = json.loads(capsys.readouterr().out)
     assert again["parameters"]["viscous_1"]["value"] == pytest.approx(found.parameters["viscous_1"].value)
+
+
+@pytest.mark.parametrize(("assumed", "base"), [("hanging", "3.1416, 0.0, 0.0"), ("wall", "1.5708, 0.0, 0.0")])
+def test_a_wrong_mount_is_named_with_the_base_to_set(setup: bench.Setup, assumed: str, base: str) -> None:
+    """The verdict was "no" without a cause."""
+    file = Path(described(setup, "held"))
+    file.write_text(file.read_text(encoding="utf-8").replace("[arm]", f"[arm]\nbase = [{base}]"), encoding="utf-8")
+    verdict = api.estimate("arm.csv", config=str(file), out=assumed).verdict
+    assert verdict is not None and verdict.trust == "no"
+    said = " ".join(verdict.sentences)
+    assert "standing upright, base = [0.0, 0.0, 0.0] under [arm]" in said
+    assert "probably because the arm is not mounted as configured" in said and "torque ripple" not in said
+    assert verdict.first is not None and verdict.first.startswith("set base = [0.0, 0.0, 0.0]")
 
 
 @pytest.mark.parametrize(
