@@ -13,31 +13,24 @@ from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
-from hil.estimation.chain_estimate import chain_facts, stopped_short, vague
-from hil.estimation.chain_mount import MountDoubt, mass_on_the_other_side, mounted_otherwise
+from hil.estimation.chain_estimate import chain_facts
 from hil.estimation.slips.sticking import sticking_joints
-from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
+from hil.estimation.torque_constants import contradictions, ratios_of
 from hil.estimation.unsettled.chain_slips import late_torque, refuse_chain_slips, torques_apart
+from hil.estimation.unsettled.chain_verdict import FITTED_SHARE, chain_verdict
 from hil.estimator.arrays import Array
 from hil.estimator.chain.column_faults import ColumnCheck
-from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel, Drive
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.prior import Prior
-from hil.estimator.chain.mount import LIKELY, SURE, better_gravity_recorded, opposed_moments
+from hil.estimator.chain.mount import better_gravity_recorded
 from hil.estimator.chain.recordings import MotionPiece, RecordedChain, identify_recordings, torque_error
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
-from hil.estimator.models.bounds import bound_sentence
-from hil.estimator.models.conflicts import Trust, conflict_sentences, contradicted, lowered
-from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Validation, Verdict
+from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Validation
 from hil.results.result import ShootingResult
 
-FITTED_SHARE = 0.75  # fraction of each recording that is fitted; the rest serves as a check
-EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
-TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative torque error on the last part: limits for yes and no
-TORQUE_UNEXPLAINED = 0.1  # limit for rejecting a model that leaves part of the motion unexplained
 UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
 
 
@@ -109,7 +102,7 @@ def estimate_chain_recordings(
         validation=Validation(
             residual_over_floor=tuple(found.residual_over_noise.tolist()) if found.simulated else None
         ),
-        verdict=_verdict(
+        verdict=chain_verdict(
             found,
             arm,
             foretold,
@@ -210,144 +203,6 @@ def _method(found: RecordedChain) -> str:
     return (
         f"filtered inverse dynamics ({found.cutoff:g} Hz) by weighted least squares: the torque was measured, not "
         f"commanded, so nothing was simulated; viscous and Coulomb friction only"
-    )
-
-
-def _verdict(
-    found: RecordedChain,
-    arm: ArmDescription,
-    foretold: Array | None,
-    prior: Prior,
-    contradictory: Sequence[str] = (),
-    late: Sequence[str] = (),
-    sticking: Sequence[int] = (),
-    gravity: Array | None = None,
-) -> Verdict:
-    """The verdict, with reasons.
-
-    contradictory, late: sentences about torques that contradict each other in the regression, or are logged late.
-    sticking: joints that stick, from 0. gravity: see `better_gravity_recorded`.
-    """
-    names = found.model.base.names
-    weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
-    trust: Trust = "yes"
-    sentences = []
-    # A regression alone does not reveal missing effects.
-    explained = not found.simulated or (
-        float(found.residual_over_noise.max()) <= EXPLAINED and found.systematic <= SYSTEMATIC
-    )
-    if found.simulated:
-        worst = float(found.residual_over_noise.max())
-        joint = arm.joints[int(np.argmax(found.residual_over_noise))].name
-        sentences.append(f"The largest residual ({joint}) is {worst:.2f} times the noise of that joint's angle.")
-        trust = trust if worst <= EXPLAINED else "with care"
-        if found.systematic > SYSTEMATIC:
-            trust = "with care"
-            sentences.append(
-                "Part of the residual repeats with the motion. This increases standard errors by a factor of up to "
-                f"{found.systematic:.1f}, and some values may be wrong by more than their standard errors. "
-                f"{_missing(found.model, gravity)}"
-            )
-    else:
-        trust = "with care"
-        sentences.append(
-            "The torque columns were treated as measurements, so the result comes from a regression; its errors are "
-            'partly systematic. If the columns hold commands, set columns.between = "held": maximum likelihood is then '
-            "far more accurate."
-        )
-    at_most, why = _judged_prediction(foretold, arm, explained, gravity is not None)
-    trust = lowered(trust, at_most)
-    sentences += why
-    if found.from_prior:
-        trust = lowered(trust, "with care")
-        sentences.append(
-            f"The recordings reveal little about {', '.join(found.from_prior)}: these values come from the URDF."
-        )
-    if said := vague(prior, names, found.std, found.from_prior):
-        trust = lowered(trust, "with care")
-        sentences.append(said)
-    if found.at_bound:
-        trust = lowered(trust, "with care")
-        sentences.append(bound_sentence(found.at_bound))
-    trust = lowered(trust, contradicted(found.conflicts, explained))
-    sentences += conflict_sentences(found.conflicts, explained)
-    joints, ratios = [joint.name for joint in arm.joints], ratios_of(found.names, found.value, found.std)
-    differ = contradictions(joints, ratios, {}, "column", found.conflicts)
-    trust = lowered(trust, "with care" if differ else "")
-    sentences += (*differ, *ratios_said(joints, ratios, "column", differ))
-    trust = lowered(trust, "with care" if late else "")
-    sentences += late
-    if contradictory and not found.simulated:
-        trust = "no"
-        sentences += contradictory
-    if not found.reached:
-        trust = lowered(trust, "with care")
-        names_stuck = [arm.joints[joint].name for joint in sticking]
-        sentences.append(stopped_short(names_stuck, "Record faster motion"))
-    mount = _doubted_mount(found, arm, prior, gravity, explained)
-    if mount is None:
-        return Verdict(trust, weakest, tuple(sentences))
-    return Verdict(lowered(trust, mount.at_most), weakest, (*sentences, *mount.said), mount.first)
-
-
-def _doubted_mount(
-    found: RecordedChain, arm: ArmDescription, prior: Prior, gravity: Array | None, explained: bool
-) -> MountDoubt | None:
-    """Return the contradiction between the centres of mass and the description, if there is one."""
-    sure = SURE if gravity is None else LIKELY
-    opposed = opposed_moments(found.names, found.value, found.std, prior, sure)
-    if gravity is None:
-        return mass_on_the_other_side(arm, opposed, explained, is_run=False)
-    return mounted_otherwise(arm, opposed, found.model.base.chain.gravity, gravity, explained, is_run=False)
-
-
-def _missing(model: ChainModel, gravity: Array | None) -> str:
-    """Say why part of the motion is unexplained. gravity: see `better_gravity_recorded`."""
-    if gravity is not None:
-        return "The model is incomplete, probably because the arm is not mounted as configured."
-    lags = ', lags that differ by joint (model.drive = "delay_lag")' if model.drive == "delay" else ""
-    return (
-        "An effect is missing from the model: torque ripple or cogging, play or elasticity of the gears, a cable, "
-        f"friction that depends on load or changes with time{lags}, or torques that differed from the commands."
-    )
-
-
-def _judged_prediction(
-    foretold: Array | None, arm: ArmDescription, explained: bool, is_mount_known: bool = False
-) -> tuple[str, tuple[str, ...]]:
-    """The best verdict that the prediction of the last part allows ("" for any), and why.
-
-    is_mount_known: whether the verdict names another mount as the cause.
-    """
-    if foretold is None:
-        return "with care", (
-            "The recordings are too short, or continue for too long after the motion has ended, to check the "
-            "prediction on a part that was not fitted.",
-        )
-    error, wrong = float(np.nanmax(foretold)), TORQUE_WRONG if explained else TORQUE_UNEXPLAINED
-    said = _foretold_said(error, arm.joints[int(np.nanargmax(foretold))].name)
-    if error <= wrong:
-        return "with care" if error > TORQUE_FORETOLD else "", (said,)
-    unexplained = "" if explained else " together with an unexplained part of the motion"
-    check = (
-        ": check which column belongs to which joint, the units and signs of the columns, whether the load changed, "
-        "and the description of the arm"
-    )
-    check = "" if is_mount_known else check
-    return "no", (said, f'An error above {100 * wrong:.0f} %{unexplained} makes the verdict "no"{check}.')
-
-
-def _foretold_said(error: float, joint: str) -> str:
-    """Describe how well the last part is predicted. error: relative to the RMS torque. joint: the joint with it."""
-    part = f"the torque in the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
-    if error > 1.0:
-        return (
-            f"When fitted to the rest, the model cannot predict {part}: the error is {error:.2g} times the "
-            f"torque's own RMS (worst joint: {joint})."
-        )
-    return (
-        f"When fitted to the rest, the model predicts {part} to within {100 * error:.1f} % of the torque's RMS (worst "
-        f"joint: {joint})."
     )
 
 

@@ -15,7 +15,8 @@ from benchmarks import chain as bench
 from hil.config.recording import parse_recording_config
 from hil.errors import ConfigError, CsvError
 from hil.estimation.unsettled import chain_recordings
-from hil.estimation.unsettled.chain_recordings import _drive, _verdict
+from hil.estimation.unsettled.chain_recordings import _drive
+from hil.estimation.unsettled.chain_verdict import chain_verdict
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.errors import ConvergenceError
 from tests.support.command_line import hil
@@ -130,21 +131,21 @@ def fitted(setup: bench.Setup, residual_over_noise: np.ndarray, systematic: floa
 
 def test_errors_that_repeat_with_the_motion_are_trusted_with_care(setup: bench.Setup) -> None:
     arm, found = fitted(setup, residual_over_noise=np.ones(4), systematic=0.9)
-    well = _verdict(found, arm, np.full(4, 0.01), setup.prior)
+    well = chain_verdict(found, arm, np.full(4, 0.01), setup.prior)
     assert well.trust == "yes"
     first = setup.arm.joints[0]
     assert well.sentences[0] == f"The largest residual ({first}) is 1.00 times the noise of that joint's angle."
     found.names, found.value = (*found.names, "torque_scale_2"), np.append(found.value, 0.7)
     found.std = np.append(found.std, 1e-3)
-    scaled = _verdict(found, arm, np.full(4, 0.01), setup.prior)
+    scaled = chain_verdict(found, arm, np.full(4, 0.01), setup.prior)
     assert scaled.trust == "with care" and "disagree by a factor of 1.43" in " ".join(scaled.sentences)
     found.names, found.value, found.std = found.names[:-1], found.value[:-1], found.std[:-1]
     found.systematic = 3.0
-    hidden = _verdict(found, arm, np.full(4, 0.01), setup.prior)
+    hidden = chain_verdict(found, arm, np.full(4, 0.01), setup.prior)
     assert hidden.trust == "with care"
     assert "repeats with the motion" in hidden.sentences[1]
     found.systematic, found.std = 0.9, 1.1 * setup.prior.std
-    assert _verdict(found, arm, np.full(4, 0.01), setup.prior).trust == "with care"
+    assert chain_verdict(found, arm, np.full(4, 0.01), setup.prior).trust == "with care"
 
 
 @pytest.mark.parametrize(("model", "drive"), [("", "delay_lag"), ('[model]\nfriction = "stribeck"\n', "delay_lag")])
@@ -158,15 +159,15 @@ def test_lags_may_differ_by_joint_unless_the_file_gives_the_drive(setup: bench.S
     assert "lag_ratio_4" not in common.names and "lags" not in common.description
     arm, found = fitted(setup, residual_over_noise=np.ones(4), systematic=3.0)
     found.model = common
-    assert "lags that differ by joint" in " ".join(_verdict(found, arm, np.full(4, 0.01), setup.prior).sentences)
+    assert "lags that differ by joint" in " ".join(chain_verdict(found, arm, np.full(4, 0.01), setup.prior).sentences)
 
 
 def test_an_incomplete_model_that_fails_its_own_prediction_is_not_trusted(setup: bench.Setup) -> None:
     arm, found = fitted(setup, residual_over_noise=np.full(4, 8.7), systematic=9.0)
-    said = _verdict(found, arm, np.full(4, 0.19), setup.prior)
+    said = chain_verdict(found, arm, np.full(4, 0.19), setup.prior)
     assert said.trust == "no"
-    assert _verdict(found, arm, np.full(4, 0.06), setup.prior).trust == "with care"
-    useless = _verdict(found, arm, np.full(4, 17.8), setup.prior)
+    assert chain_verdict(found, arm, np.full(4, 0.06), setup.prior).trust == "with care"
+    useless = chain_verdict(found, arm, np.full(4, 17.8), setup.prior)
     assert "the error is 18 times the torque's own RMS" in " ".join(useless.sentences)
 
 
