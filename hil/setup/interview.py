@@ -53,7 +53,7 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
         raise ExperimentError(
             f"Homing Offset is currently ignored ({'; '.join(homing)}). {APPLY_HOMING}, with hil init."
         )
-    names = [_name(number, found, ask) for number, found in enumerate(chosen)]
+    names = _different_names(chosen, ask, say)
     stance = _stance(ask, say)
     tilt = (
         0.0
@@ -155,8 +155,15 @@ def _known(word: str, by_id: dict[int, Found]) -> bool:
     return word.isdecimal() and int(word) in by_id
 
 
-def _name(number: int, found: Found, ask: Ask) -> str:
-    return ask(f"Name of the joint with ID {found.id}", _NAMES[number])[:20] or _NAMES[number]
+def _different_names(chosen: Sequence[Found], ask: Ask, say: Say) -> list[str]:
+    """Ask for the name of each joint, again if another joint has it."""
+    names: list[str] = []
+    for number, found in enumerate(chosen):
+        usual = next(each for each in (*_NAMES[number:], *_NAMES) if each not in names)
+        while (name := ask(f"Name of the joint with ID {found.id}", usual)[:20] or usual) in names:
+            say(f"Another joint is already named {name}: give this one a different name.")
+        names.append(name)
+    return names
 
 
 def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:

@@ -138,18 +138,21 @@ def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> None:
     """
     failed: dict[Servo, DriverError] = {}
     was_on: dict[Servo, bool] = {}
-    for servo in _on_file(port):
+    to_restore = _on_file(port)
+    for servo in to_restore:
         try:
             was_on[servo] = _switched_off(servo)
-        except PortLost:
+        except PortLost as lost:
+            lost.add_note(_cut_short(to_restore))
             raise
         except DriverError as error:
             failed[servo] = error
-    for servo, is_cut in was_on.items():
+    for number, (servo, is_cut) in enumerate(was_on.items()):
         try:
             if said := _restored(recover(servo, port.url), is_cut):
                 say(f"{servo.title}: {said}")
-        except PortLost:
+        except PortLost as lost:
+            lost.add_note(_cut_short([*list(was_on)[number:], *failed]))
             raise
         except DriverError as error:
             failed[servo] = error
@@ -161,6 +164,15 @@ def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> None:
     for servo, why in failed.items():
         if servo not in unreached:
             raise why
+
+
+def _cut_short(servos: Sequence[Servo]) -> str:
+    """Say that the port was lost before these servos were restored."""
+    files = "".join(f" {servo.title}{_file_of(servo)}." for servo in servos)
+    return (
+        f"Not restored after an earlier run, and perhaps with TORQUE ON:{files} Hold the arm or cut its power. The "
+        "next hil check, record, identify or setup on this port restores them."
+    )
 
 
 def _on_file(port: Port) -> list[Servo]:

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 
+from hil.description.regular_file import not_a_file
 from hil.drivers.adapter.device import adapter_name
 from hil.drivers.errors import WrongSetting
 from hil.errors import RunFolderError
@@ -159,6 +160,8 @@ def _has_file(port: str, servo_id: int, model: str) -> bool:
 
 def _contents(path: Path) -> bytes | None:
     """Return the contents of a file: empty if it cannot be read, None if there is no such file."""
+    if not_a_file(path):
+        return b""
     try:
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):

@@ -118,6 +118,22 @@ def test_answers_are_asked_again_until_they_make_sense(arm_file: ArmFile) -> Non
     assert parse_config(arm_toml(arm), Path("x.toml")).joints[0].position_limit == pytest.approx([-0.79, 0.79])
 
 
+def test_two_joints_are_not_given_the_same_name(arm_file: ArmFile) -> None:
+    given = ["elbow", "elbow", "wrist"]
+    said: list[str] = []
+
+    def ask(question: str, usual: str) -> str:
+        return given.pop(0) if question.startswith("Name of the joint") else usual
+
+    port = open_port(port_url(str(arm_file())), 1_000_000)
+    try:
+        arm = interview(port, "fake://", list(scan(port, (1_000_000,))), ask, said.append)
+    finally:
+        port.close()
+    assert [joint.name for joint in arm.joints] == ["elbow", "wrist"]
+    assert said[0] == "Another joint is already named elbow: give this one a different name."
+
+
 @pytest.mark.parametrize(
     ("stance", "tilt", "rest", "gravity"),
     [("hanging", "60", -math.pi / 2, 4.905), ("upright", "0", math.pi / 2, 9.81), ("flat", "no question", 0.0, 0.0)],

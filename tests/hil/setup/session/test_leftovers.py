@@ -1,6 +1,7 @@
 """`hil setup` restores what a killed run left on all servos of the port; every other command reports it."""
 
 import json
+import os
 import re
 import subprocess
 from collections.abc import Callable
@@ -94,6 +95,46 @@ def test_setup_restores_every_servo_that_a_killed_run_left_on_the_port(
     assert said.count("Operating Mode 0 -> 3") == 2
     assert bench.changed() == ["Return Delay Time of 1: 0 -> 10"]
     assert list(state_folder.glob("*.json")) == []
+
+
+@pytest.mark.parametrize(("writes", "left"), [(1, (1, 2)), (4, (2,))])
+def test_a_cable_lost_while_setup_restores_leaves_no_doubt_about_torque(
+    arm: Arm,
+    bench: Bench,
+    kill: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    *,
+    writes: int,
+    left: tuple[int, ...],
+) -> None:
+    config = arm(SHORT)
+    kill(config)
+    write = type(bench.port).write
+    sent: list[bytes] = []
+
+    def until_lost(data: bytes) -> int:
+        sent.append(data)
+        return _lost(data) if len([each for each in sent if each[7] == 3]) > writes else write(bench.port, data)
+
+    monkeypatch.setattr(bench.port, "write", until_lost)
+    assert hil("setup", config.url, "--id", 1, "--return-delay-us", 20, "--yes") == 1
+    said = capsys.readouterr().err
+    torque = next(line for line in said.splitlines() if "perhaps with TORQUE ON" in line)
+    assert [number for number in (1, 2) if f"ID {number} (" in torque] == list(left)
+    assert "hil check, record, identify or setup on this port restores them" in torque
+
+
+def test_a_pipe_in_place_of_a_settings_file_is_a_damaged_file(
+    arm: Arm, bench: Bench, capsys: pytest.CaptureFixture[str], state_folder: Path
+) -> None:
+    """Reading it would wait for a writer that never comes."""
+    config = arm(SHORT)
+    with servo_session(config):
+        pass
+    pipe = settings_file.settings_path(config.url, 2, "XM430-W350")
+    os.mkfifo(pipe)
+    assert f"ID 2: {pipe} is damaged or cannot be read" in scanned(config, capsys)
 
 
 def test_setup_restores_the_other_servos_too_if_torque_is_off_already(
