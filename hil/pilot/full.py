@@ -84,7 +84,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
                 )
             config = search.held
             plan = search.waves(config)
-        before, found = found.peak_torque, search.amplitude(config, 1.0, plan)
+        before, (found, _) = found.peak_torque, search.moving(config, search.amplitude(config, 1.0, plan))
         how = "less torque" if (found.peak_torque < before).any() else "another waveform"
         within = search.config.experiment.settle_within
         more = "" if played.passed_limit else f", with settle_within = {within:g} instead of the file's value"

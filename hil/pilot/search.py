@@ -19,7 +19,7 @@ from hil.estimator.arrays import Array, Mask
 from hil.estimator.excitation.harmonics import harmonics_within
 from hil.estimator.models.parameters import Physics
 from hil.pilot.belief import MOVED_STEPS, Belief, earlier_belief, prior_belief
-from hil.pilot.breakaway import broke_free, narrowed, raised, resting_on_stop
+from hil.pilot.breakaway import FrictionWindow, broke_free, narrowed, raised, resting_on_stop
 from hil.pilot.gains import falls_over, with_stabiliser
 from hil.pilot.options import PilotOptions
 from hil.pilot.steps import Played, Player, Step
@@ -67,9 +67,13 @@ class Search:
     before moving by MOVED_STEPS; infinite if there was no such run.
     """
 
+    window: FrictionWindow = field(init=False)
+
     def __post_init__(self) -> None:
-        self.fast = np.zeros(len(self.config.joints), dtype=np.bool_)
-        self.calm = np.full(len(self.config.joints), np.inf)
+        joints = len(self.config.joints)
+        self.fast = np.zeros(joints, dtype=np.bool_)
+        self.calm = np.full(joints, np.inf)
+        self.window = FrictionWindow.unknown(joints)
 
     @classmethod
     def of(
@@ -123,6 +127,7 @@ class Search:
             self.player.say("The arm does not move as the earlier run predicts: starting from the prior instead.")
         swing = played.step.seen[1] - played.step.seen[0] if played.seen is None else played.seen.swing
         self.swing = swing if self.swing is None else np.fmax(self.swing, swing)
+        self.window = self.window.after(self.config, played, swing)
         self._slow_down(played)
         self._stay_within_supply(played)
         if played.seen is None:
@@ -250,11 +255,40 @@ class Search:
         former = self.steps[-1].peak_torque
         wanted = raised(found.peak_torque, former, still, ratio, most)
         wanted = np.where(still, np.minimum(wanted, self.calm), wanted)
+        held = ~still & self._would_stand(found)
+        if held.any():
+            wanted = np.where(held, self._above_friction(config, held), wanted)
         if (wanted == found.peak_torque).all():
             return config, found
         risky = wanted > found.peak_torque
         config = config if falls else self._narrowed(config, risky)
         return config, self._with(config, found.plan, wanted)
+
+    def moving(self, config: Config, safe: Amplitude) -> tuple[Amplitude, Mask]:
+        """Return the amplitude `safe`, with more torque for joints that stood still with it in an earlier run, and
+        which of these joints (joints,) have not moved with the new torque yet.
+
+        Raises ExperimentError if no torque moves such a joint within its limits.
+        """
+        held = self._would_stand(safe)
+        if not held.any():
+            return safe, held
+        torque = np.where(held, self._above_friction(config, held), safe.peak_torque)
+        return self._with(config, safe.plan, torque), held & np.isinf(self.window.enough)
+
+    def _would_stand(self, found: Amplitude) -> Mask:
+        return np.asarray(found.peak_torque <= self.window.still)
+
+    def _above_friction(self, config: Config, held: Mask) -> Array:
+        """Torque (joints,) [N m] that may move the joints that friction `held` (joints,). Raises ExperimentError."""
+        options = self.options
+        ratio = options.falling_breakaway_raise if falls_over(config, self.belief) else options.breakaway_raise
+        most = np.minimum(most_torque(config), self.calm)
+        torque = self.window.next(ratio, options.torque_after_limit, most)
+        closed = held & (torque <= options.least_raise * self.window.still)
+        if closed.any():
+            raise ExperimentError(self.window.message(self.config, closed))
+        return torque
 
     def _narrowed(self, config: Config, at: Mask) -> Config:
         pose = np.array(config.arm.rest_pose) if self.pose is None else self.pose
@@ -264,21 +298,32 @@ class Search:
         """Play intermediate runs until the arm is known well enough to go straight to its limits."""
         config = self.held
         plan = self.waves(config)
-        found = self.amplitude(config, 1.0, plan)
+        found, untried = self.moving(config, self.amplitude(config, 1.0, plan))
         options, pilots = self.options, len(self.steps)
-        while not self._certain(config, found) and len(self.steps) - pilots < options.max_steps:
-            self.player.say(
-                "The estimate is still too uncertain to go straight to the limits: adding an intermediate run."
-            )
+        while (untried.any() or not self._certain(config, found)) and len(self.steps) - pilots < options.max_steps:
+            self.player.say(self._why_another(found, untried))
             number = len(self.steps) + 1
-            self._play(step_config(config, options), f"step-{number}", f"Step {number}", only_first(found, options))
+            step = step_config(config, options)
+            if untried.any() and not falls_over(config, self.belief):
+                step = self._narrowed(step, untried)
+            self._play(step, f"step-{number}", f"Step {number}", only_first(found, options))
             former, config = found.peak_torque, self.held
-            found = self.amplitude(config, 1.0, self.waves(config) if config.stabiliser is not None else plan)
+            plan = self.waves(config) if config.stabiliser is not None else plan
+            found, untried = self.moving(config, self.amplitude(config, 1.0, plan))
             is_fair = self._shares(found).min() > options.fair_share
             worthwhile = options.worthwhile_raise if is_fair else options.worthwhile_raise_far
             if (found.peak_torque <= worthwhile * former).all():
                 break  # the updated belief allows hardly any more torque
         return config, self._roomiest(config, found)
+
+    def _why_another(self, found: Amplitude, untried: Mask) -> str:
+        if not untried.any():
+            return "The estimate is still too uncertain to go straight to the limits: adding an intermediate run."
+        torque = ", ".join(f"{each:.3g}" for each in found.peak_torque[untried])
+        return (
+            f"{_and(_names(self.config, untried))} did not move with the largest torque that is safe for all plausible "
+            f"arms. Repeating with {torque} N m, and stopping soon after a joint moves."
+        )
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
         """Return `found` or, if it leaves much of the position range unused, the amplitude with other waves whose
@@ -290,6 +335,8 @@ class Search:
             return found
         for plan in roomy_plans(config, Physics.of(self.belief.middle), 1 + options.other_waves)[1:]:
             other = self.amplitude(config, 1.0, plan)
+            if self._would_stand(other).any():
+                continue
             found = max(found, other, key=lambda each: float(used_range(each).min()))
             if used_range(found).min() >= options.wide_range:
                 break

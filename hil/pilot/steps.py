@@ -9,7 +9,7 @@ from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import GUARDED, QUANTITIES, UNITS, peaks_of
-from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, symptom_of
 from hil.estimator.arrays import Array
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Watch
@@ -97,6 +97,12 @@ class Played:
         return isinstance(self.error, SafetyStop) and self.error.cause is Cause.VELOCITY
 
     @property
+    def stood_still(self) -> bool:
+        """Whether the run was stopped because at least one joint did not move."""
+        unexpected = isinstance(self.error, SafetyStop) and self.error.cause is Cause.UNEXPECTED
+        return unexpected or isinstance(self.error, DidNotMove)
+
+    @property
     def unlike_before(self) -> bool:
         """Whether the run was stopped because its motion did not repeat."""
         return isinstance(self.error, SafetyStop) and self.error.cause is Cause.UNLIKE_BEFORE
@@ -138,8 +144,10 @@ class Player:
         prediction = found.prediction
         step = Step(name, found.peak_torque, prediction.median, prediction.quantile, peaks, str(error or ""))
         self.say(str(step))
-        if isinstance(error, SafetyStop):
-            self.say(f"{name} ended early: {error}")
+        if error is not None:
+            # The advice for a joint that did not move, or a motion that did not settle, is the pilot's own task.
+            why = str(error) if isinstance(error, SafetyStop) else f"{symptom_of(error)}."
+            self.say(f"{name} ended early: {why}")
         if not step.within:
             self.say(
                 f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from the "
