@@ -198,7 +198,12 @@ class NotSettled(ExperimentError):
 
 
 class DidNotMove(ExperimentError):
-    """A joint stood still for a whole period. Example: torque below static friction, or a jammed gear."""
+    """A joint stood still for a whole period. Example: torque below static friction, or a jammed gear.
+
+    joint: index of that joint, if known.
+    """
+
+    joint: int | None = None
 
 
 class RecordingCutShort(ExperimentError):

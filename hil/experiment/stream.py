@@ -328,14 +328,16 @@ class Stream:
 
     def _check_motion(self, moved: Sequence[float]) -> None:
         """Detect, after a period, a joint held by friction or an obstacle, before more time is wasted."""
-        for joint, way in zip(self._bus.joints, moved, strict=True):
+        for index, (joint, way) in enumerate(zip(self._bus.joints, moved, strict=True)):
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
                 against = f" Or {opposed(joint)}" if joint.seconds else ""
-                raise DidNotMove(
+                error = DidNotMove(
                     f"{joint.title} moved by only {way:.4f} rad in a whole period: it is stuck, friction holds it, or "
                     f"{without_torque(joint)}.{against} Move it by hand with torque off; if it is free, check its "
                     f"wiring and its gear, or {self._more_torque()}."
                 )
+                error.joint = index
+                raise error
 
     def _more_torque(self) -> str:
         if self._config.is_chain:

@@ -101,8 +101,8 @@ class FrictionWindow:
         """The window after a run on an arm with the limits of `config`. swing: range of motion (joints,) [rad]."""
         torque = played.step.peak_torque
         step = np.array([joint.joint.servo.position_unit for joint in config.joints])
-        moved = swing > MOVED_STEPS * step
-        stood = ~moved & played.stood_still
+        stood = played.stood_still(swing / step)
+        moved = ~stood & (swing > MOVED_STEPS * step)
         passed = _beyond_limits(config, played.step.seen) & played.passed_limit
         still = np.where(stood, np.maximum(self.still, torque), self.still)
         still = np.where(moved & (torque <= still), 0.0, still)
@@ -167,7 +167,7 @@ def _closed(joint: JointConfig, rest: float, still: float, exceeding: float) -> 
     room, end = min((rest - low, "lower"), (high - rest, "upper"))
     exceeded = f", but exceeded a limit with {exceeding:.3g} N m" if np.isfinite(exceeding) else ""
     return (
-        f"{joint.joint.title} stood still with a peak torque of {still:.3g} N m{exceeded}. At rest, it is only "
+        f"{joint.joint.title} stood still with a peak torque of {still:.3g} N m{exceeded}. At rest, it is "
         f"{room:.2g} rad from the {end} end of its position_limit."
     )
 

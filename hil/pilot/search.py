@@ -264,17 +264,33 @@ class Search:
         config = config if falls else self._narrowed(config, risky)
         return config, self._with(config, found.plan, wanted)
 
-    def moving(self, config: Config, safe: Amplitude) -> tuple[Amplitude, Mask]:
-        """Return the amplitude `safe`, with more torque for joints that stood still with it in an earlier run, and
-        which of these joints (joints,) have not moved with the new torque yet.
+    def moving(self, plan: Plan) -> tuple[Config, Amplitude]:
+        """The configuration and the largest amplitude that is safe for all plausible arms. Joints that stood still with
+        it get more torque, with which they have moved in an earlier run or in one that is played now, between narrow
+        limits.
 
-        Raises ExperimentError if no torque moves such a joint within its limits.
+        Raises the same errors as a run, and ExperimentError if no torque moves such a joint within its limits.
         """
-        held = self._would_stand(safe)
-        if not held.any():
-            return safe, held
-        torque = np.where(held, self._above_friction(config, held), safe.peak_torque)
-        return self._with(config, safe.plan, torque), held & np.isinf(self.window.enough)
+        for _ in range(self.options.max_steps):
+            config = self.held
+            found = self.amplitude(config, 1.0, plan)
+            held = self._would_stand(found)
+            if not held.any():
+                break
+            found = self._with(config, plan, np.where(held, self._above_friction(config, held), found.peak_torque))
+            untried = held & np.isinf(self.window.enough)
+            if not untried.any():
+                break
+            self.player.say(
+                f"{_and(_names(self.config, untried))} did not move with the largest torque that is safe for all "
+                "plausible arms: trying more torque between narrow limits."
+            )
+            self._step(config if falls_over(config, self.belief) else self._narrowed(config, untried), found)
+        return config, found
+
+    def _step(self, config: Config, found: Amplitude) -> None:
+        number, options = len(self.steps) + 1, self.options
+        self._play(step_config(config, options), f"step-{number}", f"Step {number}", only_first(found, options))
 
     def _would_stand(self, found: Amplitude) -> Mask:
         return np.asarray(found.peak_torque <= self.window.still)
@@ -296,34 +312,21 @@ class Search:
 
     def _raise_to_limits(self) -> tuple[Config, Amplitude]:
         """Play intermediate runs until the arm is known well enough to go straight to its limits."""
-        config = self.held
-        plan = self.waves(config)
-        found, untried = self.moving(config, self.amplitude(config, 1.0, plan))
+        plan = self.waves(self.held)
+        config, found = self.moving(plan)
         options, pilots = self.options, len(self.steps)
-        while (untried.any() or not self._certain(config, found)) and len(self.steps) - pilots < options.max_steps:
-            self.player.say(self._why_another(found, untried))
-            number = len(self.steps) + 1
-            step = step_config(config, options)
-            if untried.any() and not falls_over(config, self.belief):
-                step = self._narrowed(step, untried)
-            self._play(step, f"step-{number}", f"Step {number}", only_first(found, options))
-            former, config = found.peak_torque, self.held
-            plan = self.waves(config) if config.stabiliser is not None else plan
-            found, untried = self.moving(config, self.amplitude(config, 1.0, plan))
+        while not self._certain(config, found) and len(self.steps) - pilots < options.max_steps:
+            self.player.say(
+                "The estimate is still too uncertain to go straight to the limits: adding an intermediate run."
+            )
+            former = found.peak_torque
+            self._step(config, found)
+            config, found = self.moving(self.waves(self.held) if config.stabiliser is not None else plan)
             is_fair = self._shares(found).min() > options.fair_share
             worthwhile = options.worthwhile_raise if is_fair else options.worthwhile_raise_far
             if (found.peak_torque <= worthwhile * former).all():
                 break  # the updated belief allows hardly any more torque
         return config, self._roomiest(config, found)
-
-    def _why_another(self, found: Amplitude, untried: Mask) -> str:
-        if not untried.any():
-            return "The estimate is still too uncertain to go straight to the limits: adding an intermediate run."
-        torque = ", ".join(f"{each:.3g}" for each in found.peak_torque[untried])
-        return (
-            f"{_and(_names(self.config, untried))} did not move with the largest torque that is safe for all plausible "
-            f"arms. Repeating with {torque} N m, and stopping soon after a joint moves."
-        )
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
         """Return `found` or, if it leaves much of the position range unused, the amplitude with other waves whose

@@ -10,7 +10,7 @@ from hil.dry_run.amplitude import Amplitude
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import GUARDED, QUANTITIES, UNITS, peaks_of
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, symptom_of
-from hil.estimator.arrays import Array
+from hil.estimator.arrays import Array, Mask
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Watch
 from hil.pilot.belief import MOVED_STEPS
@@ -96,11 +96,16 @@ class Played:
         """Whether the guard stopped the run because a joint was too fast."""
         return isinstance(self.error, SafetyStop) and self.error.cause is Cause.VELOCITY
 
-    @property
-    def stood_still(self) -> bool:
-        """Whether the run was stopped because at least one joint did not move."""
+    def stood_still(self, swing: Array) -> Mask:
+        """Which joints (joints,) stood still in a run that was stopped for this reason.
+
+        swing: range of motion (joints,) [encoder steps].
+        """
         unexpected = isinstance(self.error, SafetyStop) and self.error.cause is Cause.UNEXPECTED
-        return unexpected or isinstance(self.error, DidNotMove)
+        stood = (swing <= MOVED_STEPS) & (unexpected or isinstance(self.error, DidNotMove))
+        if isinstance(self.error, DidNotMove) and self.error.joint is not None:
+            stood[self.error.joint] = True  # it may have moved before
+        return np.asarray(stood)
 
     @property
     def unlike_before(self) -> bool:
