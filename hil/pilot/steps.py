@@ -150,9 +150,7 @@ class Player:
         step = Step(name, found.peak_torque, prediction.median, prediction.quantile, peaks, str(error or ""))
         self.say(str(step))
         if error is not None:
-            # The advice for a joint that did not move, or a motion that did not settle, is the pilot's own task.
-            why = str(error) if isinstance(error, SafetyStop) else f"{symptom_of(error)}."
-            self.say(f"{name} ended early: {why}")
+            self.say(ended_early(name, error))
         if not step.within:
             self.say(
                 f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from the "
@@ -161,6 +159,14 @@ class Player:
         limited = isinstance(error, SafetyStop) and error.cause is Cause.OUT_OF_VOLTAGE
         delivered = delivered_speed(config, samples) if limited else None
         return Played(step, seen_of(config, samples), torque, error, delivered)
+
+
+def ended_early(name: str, error: ExperimentError) -> str:
+    """Say why a run ended early.
+
+    If a joint did not move, or the motion did not settle, what to do about it is the pilot's task, and is not said.
+    """
+    return f"{name} ended early: {error if isinstance(error, SafetyStop) else f'{symptom_of(error)}.'}"
 
 
 def tells_of_the_arm(error: ExperimentError) -> bool:
