@@ -22,6 +22,7 @@ hil.drivers.errors.DriverError  1   communication with the servos
 hil.estimator.errors.EstimationError  1   the recording does not determine the parameters
 """
 
+import re
 import signal
 from enum import Enum
 
@@ -43,6 +44,7 @@ __all__ = [
     "SchedulerLost",
     "StopRequested",
     "Unheard",
+    "symptom_of",
 ]
 
 
@@ -196,8 +198,18 @@ class NotSettled(ExperimentError):
 
 
 class DidNotMove(ExperimentError):
-    """A joint stood still for a whole period. Example: torque below static friction, or a jammed gear."""
+    """A joint stood still for a whole period. Example: torque below static friction, or a jammed gear.
+
+    joint: index of that joint, if known.
+    """
+
+    joint: int | None = None
 
 
 class RecordingCutShort(ExperimentError):
     """The recording ends before a settled period. Example: the process was killed during settling."""
+
+
+def symptom_of(error: Exception) -> str:
+    """Return what happened, without the possible causes and the advice that follow it in the message."""
+    return re.split(r"[.:] ", str(error), maxsplit=1)[0].rstrip(".")

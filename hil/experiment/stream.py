@@ -9,7 +9,6 @@ of a stop allows it, the arm is braked before `run` raises; the caller, which sw
 """
 
 import math
-import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import NamedTuple
@@ -22,7 +21,7 @@ from hil.drivers.errors import BusOverheard, DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, symptom_of
 from hil.estimator.arrays import Array
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.estimator.data.periodicity import WARMEST, correlation_of_changes, decay_of
@@ -69,13 +68,16 @@ for late commands: if the cable is unplugged during braking, the current must no
 
 
 class Progress(NamedTuple):
-    """What the user is shown: number of samples taken and expected, phase, role of the multisine, and latest state."""
+    """What the user is shown: number of samples taken and expected, phase, role of the multisine, latest state, and
+    peak torque of the run (joints,) [N m].
+    """
 
     taken: int
     expected: int
     phase: Phase
     role: str
     state: State
+    peak_torque: tuple[float, ...] = ()
 
 
 Watch = Callable[[Progress], None]
@@ -133,6 +135,9 @@ class Stream:
         self._watch = watch
         self._note = note
         self._pace = Pace(bus, plan.rate, self._guard)
+        self._peak_torque = tuple(
+            peak * joint.torque_per_goal for peak, joint in zip(planned, config.joints, strict=True)
+        )
         self._watch_every = max(1, round(_WATCH_EVERY_S * plan.rate))
         self._goal = [0.0] * len(bus.joints)
         self._segment = 0
@@ -188,8 +193,7 @@ class Stream:
             try:
                 self._guard.torque_is_off(dead)
             except SafetyStop as lost:
-                symptom = re.split(r"[.:] ", str(error), maxsplit=1)[0].rstrip(".")  # without the other causes
-                lost.args = (f"{lost} Symptom: {symptom}.",)
+                lost.args = (f"{lost} Symptom: {symptom_of(error)}.",)
                 lost.overruled = True
                 for note in getattr(error, "__notes__", ()):
                     lost.add_note(note)
@@ -324,14 +328,16 @@ class Stream:
 
     def _check_motion(self, moved: Sequence[float]) -> None:
         """Detect, after a period, a joint held by friction or an obstacle, before more time is wasted."""
-        for joint, way in zip(self._bus.joints, moved, strict=True):
+        for index, (joint, way) in enumerate(zip(self._bus.joints, moved, strict=True)):
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
                 against = f" Or {opposed(joint)}" if joint.seconds else ""
-                raise DidNotMove(
+                error = DidNotMove(
                     f"{joint.title} moved by only {way:.4f} rad in a whole period: it is stuck, friction holds it, or "
                     f"{without_torque(joint)}.{against} Move it by hand with torque off; if it is free, check its "
                     f"wiring and its gear, or {self._more_torque()}."
                 )
+                error.joint = index
+                raise error
 
     def _more_torque(self) -> str:
         if self._config.is_chain:
@@ -408,7 +414,7 @@ class Stream:
         taken = self._recorder.count
         if taken % self._watch_every == 0 or state.slow is not None:
             role = self._plan.segments[self._segment].role
-            self._watch(Progress(taken, self._plan.expected, phase, role, state))
+            self._watch(Progress(taken, self._plan.expected, phase, role, state, self._peak_torque))
         return state
 
     def _look(self, state: State, phase: Phase, *, between: bool = False) -> None:

@@ -6,12 +6,16 @@ torque makes a joint exceed a limit. The guard is therefore given narrow positio
 is raised by a constant ratio from run to run, up to the current limit. As soon as the joint moves and so reveals its
 friction, the arm is braked and the run ends.
 
+If little room separates a joint's rest pose from a position limit, the largest torque that is safe for all plausible
+arms may be too small to move the real one again. `FrictionWindow` keeps the search from repeating such a run.
+
 A joint that gravity presses against an end stop also stands still until its torque lifts it. In the following runs, it
 would bounce on this end stop, which the model of a planar arm does not include.
 """
 
 import math
 from contextlib import suppress
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,8 +26,10 @@ from hil.estimator.arrays import Array, Mask
 from hil.estimator.baselines.torque_faults import suspect_stop
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
+from hil.pilot.belief import MOVED_STEPS
 from hil.pilot.options import PilotOptions
 from hil.pilot.seen import Seen
+from hil.pilot.steps import Played
 
 _LEANS = 0.1
 """Gravity may press a link against something if the absolute cosine of the link's angle at rest is at least this."""
@@ -69,8 +75,67 @@ def broke_free(config: Config, narrow: Config, seen: Array) -> Mask:
     """
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     near_low, near_high = np.array([joint.position_limit for joint in narrow.joints]).T
-    closer = (near_low > low) | (near_high < high)
-    return np.asarray(closer & ((seen[0] < near_low) | (seen[1] > near_high)))
+    past = ((seen[0] < near_low) & (near_low > low)) | ((seen[1] > near_high) & (near_high < high))
+    return np.asarray(past & (seen[0] >= low) & (seen[1] <= high))
+
+
+@dataclass(frozen=True)
+class FrictionWindow:
+    """Between which peak torques (joints,) [N m] a joint moves without exceeding its limits, as far as runs have shown.
+
+    still: largest torque with which the joint stood still in a run that was stopped for this reason; 0 if none.
+    enough: smallest larger torque with which it moved within its limits; infinite if none. exceeding: smallest torque
+    with which it exceeded a limit; infinite if none.
+    """
+
+    still: Array
+    enough: Array
+    exceeding: Array
+
+    @classmethod
+    def unknown(cls, joints: int) -> "FrictionWindow":
+        """The window before the first run."""
+        return cls(np.zeros(joints), np.full(joints, np.inf), np.full(joints, np.inf))
+
+    def after(self, config: Config, played: Played, swing: Array) -> "FrictionWindow":
+        """The window after a run on an arm with the limits of `config`. swing: range of motion (joints,) [rad]."""
+        torque = played.step.peak_torque
+        step = np.array([joint.joint.servo.position_unit for joint in config.joints])
+        stood = played.stood_still(swing / step)
+        moved = ~stood & (swing > MOVED_STEPS * step)
+        passed = _beyond_limits(config, played.step.seen) & played.passed_limit
+        still = np.where(stood, np.maximum(self.still, torque), self.still)
+        still = np.where(moved & (torque <= still), 0.0, still)
+        exceeding = np.where(passed, np.minimum(self.exceeding, torque), self.exceeding)
+        enough = np.where(moved & ~passed, np.minimum(self.enough, torque), self.enough)
+        enough = np.where((enough <= still) | (enough >= exceeding), np.inf, enough)
+        return FrictionWindow(still, enough, exceeding)
+
+    def next(self, ratio: float, below: float, most: Array) -> Array:
+        """The torque to try next with joints that stood still (joints,) [N m].
+
+        ratio: relative to the torque with which the joint stood still. below: largest torque, relative to one that
+        exceeded a limit. most: largest allowed torque (joints,) [N m].
+        """
+        untried = np.minimum(ratio * self.still, below * self.exceeding)
+        return np.asarray(np.minimum(np.where(np.isfinite(self.enough), self.enough, untried), most))
+
+    def message(self, config: Config, closed: Mask) -> str:
+        """Say that no torque moves the `closed` joints (joints,) within their limits, and what to change."""
+        said = " ".join(
+            _closed(joint, rest, still, exceeding)
+            for joint, rest, still, exceeding, is_closed in zip(
+                *(config.joints, config.arm.rest_pose, self.still.tolist(), self.exceeding.tolist(), closed.tolist()),
+                strict=True,
+            )
+            if is_closed
+        )
+        return (
+            f"{said} More torque is not safe, and less does not overcome friction. If a hard stop, a table or a cable "
+            "holds the arm near its rest pose, change the mounting so that it hangs freely, then correct arm.rest_pose "
+            "and widen position_limit. If the joint turns freely by hand, raise the lower limit of experiment.band: "
+            "at higher frequencies, more torque is safe."
+        )
 
 
 def resting_on_stop(config: Config, seen: Seen) -> str:
@@ -95,3 +160,19 @@ def resting_on_stop(config: Config, seen: Seen) -> str:
         "end stops. Change the mounting, or what the arm rests on, so that the arm hangs freely, then correct "
         "arm.rest_pose; or describe the arm with a URDF, in which case joints may rest against end stops."
     )
+
+
+def _closed(joint: JointConfig, rest: float, still: float, exceeding: float) -> str:
+    low, high = joint.position_limit
+    room, end = min((rest - low, "lower"), (high - rest, "upper"))
+    exceeded = f", but exceeded a limit with {exceeding:.3g} N m" if np.isfinite(exceeding) else ""
+    return (
+        f"{joint.joint.title} stood still with a peak torque of {still:.3g} N m{exceeded}. At rest, it is "
+        f"{room:.2g} rad from the {end} end of its position_limit."
+    )
+
+
+def _beyond_limits(config: Config, seen: Array) -> Mask:
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    speed = np.array([joint.velocity_limit for joint in config.joints])
+    return np.asarray((seen[0] < low) | (seen[1] > high) | (seen[2] > speed))

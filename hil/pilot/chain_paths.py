@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.clearance.space import Space
-from hil.config.chain import DEFAULT_BAND, POSITION_RESERVE
+from hil.config.chain import DEFAULT_BAND, POSITION_RESERVE, described_arm, doubted_inertias
 from hil.config.schema import Config
 from hil.errors import NoSafeTorque
 from hil.estimator.arrays import Array
@@ -25,6 +25,8 @@ RAMP_SPEED = 1.2
 RAMP_SPEED_SHARE = 0.35
 _PEAK = 1.875
 _WAY_POSES = 40
+_POSES = 200
+"""Number of random poses in which the described arm's weight is compared with its torque limits."""
 
 
 @dataclass(frozen=True)
@@ -107,9 +109,10 @@ class Paths:
             best = designer.design(experiment.seed, tell=tell)
             other = designer.widest(best.centre, experiment.seed + 1)
         except ExcitationError as error:
+            suspected = _of_the_description(config, thought, most)
             raise NoSafeTorque(
-                f"{config.path}: {error}. Widen position_limit, raise {limit_names(config)}, correct [clearance], or "
-                "set [joint_path] and pilot = false."
+                f"{config.path}: {error}. {suspected}{'Otherwise, widen' if suspected else 'Widen'} position_limit, "
+                f"raise {limit_names(config)}, correct [clearance], or set [joint_path] and pilot = false."
             ) from error
         return cls(config, designer, best, other, reserve)
 
@@ -150,6 +153,41 @@ def chain_config(config: Config) -> Config:
     band = experiment.band or list(DEFAULT_BAND)
     ramp = float(np.ceil(min(ramp, 0.6 * experiment.period, 60.0) * 10) / 10)
     return config.model_copy(update={"experiment": experiment.model_copy(update={"band": band, "ramp": ramp})})
+
+
+def _of_the_description(config: Config, thought: ChainTorque, most: Array) -> str:
+    """Say why the masses and inertias of the description may be the reason that no path is allowed; "" if nothing
+    suggests it.
+
+    most: torque that a path may require (joints,) [N m].
+    """
+    arm = described_arm(config)
+    doubts = doubted_inertias(arm)
+    said = [_too_heavy(config, arm.path.name, thought, most)]
+    if doubts:
+        more = f" (`hil check` lists {len(doubts) - 1} more)" if len(doubts) > 1 else ""
+        said.append(f"The description may be the cause{more}: {doubts[0]}")
+    return "".join(f"{sentence} " for sentence in said if sentence)
+
+
+def _too_heavy(config: Config, name: str, thought: ChainTorque, most: Array) -> str:
+    """Say so if the described arm, even at rest, requires too much torque in all of many random poses.
+
+    name: name of the description's file.
+    """
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    random = np.random.default_rng(config.experiment.seed)
+    poses = random.uniform(low[:, None], high[:, None], (len(low), _POSES))
+    still = np.zeros_like(poses)
+    holding = np.abs(thought.of(Path(poses, still, still)))
+    if not (holding > most[:, None]).any(axis=0).all():
+        return ""
+    joint = int(np.argmax((holding / most[:, None]).mean(axis=1)))
+    return (
+        f"According to {name}, gravity alone requires more torque than a path may use in each of {_POSES} random "
+        f"poses: on average {holding[joint].mean():.2g} N m of {most[joint]:.2g} N m at "
+        f"{config.joints[joint].joint.title}. Check the masses and centres of mass in {name}."
+    )
 
 
 def _ways(path: Path, rest: Array, share: float) -> Array:

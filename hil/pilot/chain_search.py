@@ -25,7 +25,7 @@ from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
 from hil.pilot.chain_shares import PILOT_SHARES, SHARES, Found, SafeShares, step_config
 from hil.pilot.punctual import punctual
-from hil.pilot.steps import Step, tells_of_the_arm
+from hil.pilot.steps import Step, ended_early, tells_of_the_arm
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
@@ -178,7 +178,7 @@ class ChainSearch(SafeShares):
             f"{found.foreseen}."
         )
         if error is not None:
-            self.say(f"{name} ended early: {error} {self.torque}")
+            self.say(f"{ended_early(name, error)} {self.torque}")
         elif not step.within:
             self.say(
                 f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from the "

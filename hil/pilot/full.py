@@ -71,7 +71,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
             raise played.error
         run.set_aside(f"stopped-{number}", chosen)
         if played.passed_limit:
-            config, plan = search.held, found.plan
+            plan = found.plan
         else:
             search.cap = _after_unsettled(search, found, played.error)
             search.config = _tolerant(search.config, options.max_settle_within)
@@ -82,9 +82,9 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
                     "At higher frequencies, more torque is safe and friction does not hold the arm: the waves now "
                     f"cover {band[0]:g} to {band[1]:g} Hz."
                 )
-            config = search.held
-            plan = search.waves(config)
-        before, found = found.peak_torque, search.amplitude(config, 1.0, plan)
+            plan = search.waves(search.held)
+        before = found.peak_torque
+        config, found = search.moving(plan)
         how = "less torque" if (found.peak_torque < before).any() else "another waveform"
         within = search.config.experiment.settle_within
         more = "" if played.passed_limit else f", with settle_within = {within:g} instead of the file's value"

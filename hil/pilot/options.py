@@ -35,6 +35,8 @@ class PilotOptions:
     """
     breakaway_raise: float = 1.6
     """Ratio of successive peak torques of a joint that has not moved yet."""
+    least_raise: float = 1.03
+    """Smallest ratio of a joint's torque to one with which it stood still, for which another run is worthwhile."""
     breakaway_room: float = 0.25
     """A joint that has just broken away is stopped after this fraction of the distance to its position limits."""
     min_breakaway_steps: int = 60

@@ -19,7 +19,7 @@ from hil.estimator.arrays import Array, Mask
 from hil.estimator.excitation.harmonics import harmonics_within
 from hil.estimator.models.parameters import Physics
 from hil.pilot.belief import MOVED_STEPS, Belief, earlier_belief, prior_belief
-from hil.pilot.breakaway import broke_free, narrowed, raised, resting_on_stop
+from hil.pilot.breakaway import FrictionWindow, broke_free, narrowed, raised, resting_on_stop
 from hil.pilot.gains import falls_over, with_stabiliser
 from hil.pilot.options import PilotOptions
 from hil.pilot.steps import Played, Player, Step
@@ -67,9 +67,13 @@ class Search:
     before moving by MOVED_STEPS; infinite if there was no such run.
     """
 
+    window: FrictionWindow = field(init=False)
+
     def __post_init__(self) -> None:
-        self.fast = np.zeros(len(self.config.joints), dtype=np.bool_)
-        self.calm = np.full(len(self.config.joints), np.inf)
+        joints = len(self.config.joints)
+        self.fast = np.zeros(joints, dtype=np.bool_)
+        self.calm = np.full(joints, np.inf)
+        self.window = FrictionWindow.unknown(joints)
 
     @classmethod
     def of(
@@ -123,6 +127,7 @@ class Search:
             self.player.say("The arm does not move as the earlier run predicts: starting from the prior instead.")
         swing = played.step.seen[1] - played.step.seen[0] if played.seen is None else played.seen.swing
         self.swing = swing if self.swing is None else np.fmax(self.swing, swing)
+        self.window = self.window.after(self.config, played, swing)
         self._slow_down(played)
         self._stay_within_supply(played)
         if played.seen is None:
@@ -250,11 +255,56 @@ class Search:
         former = self.steps[-1].peak_torque
         wanted = raised(found.peak_torque, former, still, ratio, most)
         wanted = np.where(still, np.minimum(wanted, self.calm), wanted)
+        held = ~still & self._would_stand(found)
+        if held.any():
+            wanted = np.where(held, self._above_friction(config, held), wanted)
         if (wanted == found.peak_torque).all():
             return config, found
         risky = wanted > found.peak_torque
         config = config if falls else self._narrowed(config, risky)
         return config, self._with(config, found.plan, wanted)
+
+    def moving(self, plan: Plan) -> tuple[Config, Amplitude]:
+        """The configuration and the largest amplitude that is safe for all plausible arms. Joints that stood still with
+        it get more torque, with which they have moved in an earlier run or in one that is played now, between narrow
+        limits.
+
+        Raises the same errors as a run, and ExperimentError if no torque moves such a joint within its limits.
+        """
+        for _ in range(self.options.max_steps):
+            config = self.held
+            found = self.amplitude(config, 1.0, plan)
+            held = self._would_stand(found)
+            if not held.any():
+                break
+            found = self._with(config, plan, np.where(held, self._above_friction(config, held), found.peak_torque))
+            untried = held & np.isinf(self.window.enough)
+            if not untried.any():
+                break
+            self.player.say(
+                f"{_and(_names(self.config, untried))} did not move with the largest torque that is safe for all "
+                "plausible arms: trying more torque between narrow limits."
+            )
+            self._step(config if falls_over(config, self.belief) else self._narrowed(config, untried), found)
+        return config, found
+
+    def _step(self, config: Config, found: Amplitude) -> None:
+        number, options = len(self.steps) + 1, self.options
+        self._play(step_config(config, options), f"step-{number}", f"Step {number}", only_first(found, options))
+
+    def _would_stand(self, found: Amplitude) -> Mask:
+        return np.asarray(found.peak_torque <= self.window.still)
+
+    def _above_friction(self, config: Config, held: Mask) -> Array:
+        """Torque (joints,) [N m] that may move the joints that friction `held` (joints,). Raises ExperimentError."""
+        options = self.options
+        ratio = options.falling_breakaway_raise if falls_over(config, self.belief) else options.breakaway_raise
+        most = np.minimum(most_torque(config), self.calm)
+        torque = self.window.next(ratio, options.torque_after_limit, most)
+        closed = held & (torque <= options.least_raise * self.window.still)
+        if closed.any():
+            raise ExperimentError(self.window.message(self.config, closed))
+        return torque
 
     def _narrowed(self, config: Config, at: Mask) -> Config:
         pose = np.array(config.arm.rest_pose) if self.pose is None else self.pose
@@ -262,18 +312,16 @@ class Search:
 
     def _raise_to_limits(self) -> tuple[Config, Amplitude]:
         """Play intermediate runs until the arm is known well enough to go straight to its limits."""
-        config = self.held
-        plan = self.waves(config)
-        found = self.amplitude(config, 1.0, plan)
+        plan = self.waves(self.held)
+        config, found = self.moving(plan)
         options, pilots = self.options, len(self.steps)
         while not self._certain(config, found) and len(self.steps) - pilots < options.max_steps:
             self.player.say(
                 "The estimate is still too uncertain to go straight to the limits: adding an intermediate run."
             )
-            number = len(self.steps) + 1
-            self._play(step_config(config, options), f"step-{number}", f"Step {number}", only_first(found, options))
-            former, config = found.peak_torque, self.held
-            found = self.amplitude(config, 1.0, self.waves(config) if config.stabiliser is not None else plan)
+            former = found.peak_torque
+            self._step(config, found)
+            config, found = self.moving(self.waves(self.held) if config.stabiliser is not None else plan)
             is_fair = self._shares(found).min() > options.fair_share
             worthwhile = options.worthwhile_raise if is_fair else options.worthwhile_raise_far
             if (found.peak_torque <= worthwhile * former).all():
@@ -290,6 +338,8 @@ class Search:
             return found
         for plan in roomy_plans(config, Physics.of(self.belief.middle), 1 + options.other_waves)[1:]:
             other = self.amplitude(config, 1.0, plan)
+            if self._would_stand(other).any():
+                continue
             found = max(found, other, key=lambda each: float(used_range(each).min()))
             if used_range(found).min() >= options.wide_range:
                 break

@@ -9,8 +9,8 @@ from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import GUARDED, QUANTITIES, UNITS, peaks_of
-from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
-from hil.estimator.arrays import Array
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, symptom_of
+from hil.estimator.arrays import Array, Mask
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Watch
 from hil.pilot.belief import MOVED_STEPS
@@ -96,6 +96,17 @@ class Played:
         """Whether the guard stopped the run because a joint was too fast."""
         return isinstance(self.error, SafetyStop) and self.error.cause is Cause.VELOCITY
 
+    def stood_still(self, swing: Array) -> Mask:
+        """Which joints (joints,) stood still in a run that was stopped for this reason.
+
+        swing: range of motion (joints,) [encoder steps].
+        """
+        unexpected = isinstance(self.error, SafetyStop) and self.error.cause is Cause.UNEXPECTED
+        stood = (swing <= MOVED_STEPS) & (unexpected or isinstance(self.error, DidNotMove))
+        if isinstance(self.error, DidNotMove) and self.error.joint is not None:
+            stood[self.error.joint] = True  # it may have moved before
+        return np.asarray(stood)
+
     @property
     def unlike_before(self) -> bool:
         """Whether the run was stopped because its motion did not repeat."""
@@ -138,8 +149,8 @@ class Player:
         prediction = found.prediction
         step = Step(name, found.peak_torque, prediction.median, prediction.quantile, peaks, str(error or ""))
         self.say(str(step))
-        if isinstance(error, SafetyStop):
-            self.say(f"{name} ended early: {error}")
+        if error is not None:
+            self.say(ended_early(name, error))
         if not step.within:
             self.say(
                 f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from the "
@@ -148,6 +159,14 @@ class Player:
         limited = isinstance(error, SafetyStop) and error.cause is Cause.OUT_OF_VOLTAGE
         delivered = delivered_speed(config, samples) if limited else None
         return Played(step, seen_of(config, samples), torque, error, delivered)
+
+
+def ended_early(name: str, error: ExperimentError) -> str:
+    """Say why a run ended early.
+
+    If a joint did not move, or the motion did not settle, what to do about it is the pilot's task, and is not said.
+    """
+    return f"{name} ended early: {error if isinstance(error, SafetyStop) else f'{symptom_of(error)}.'}"
 
 
 def tells_of_the_arm(error: ExperimentError) -> bool:

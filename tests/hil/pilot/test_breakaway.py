@@ -1,5 +1,6 @@
 """Joints that friction holds get more torque from run to run, between narrow limits, up to the current limit."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,15 @@ import numpy as np
 import pytest
 
 from hil.config.schema import Config, load_config, parse_config
-from hil.dry_run.amplitude import most_torque
+from hil.dry_run.amplitude import Amplitude, most_torque, with_peaks
 from hil.errors import Cause, DidNotMove, ExperimentError, NoSafeTorque, NotSettled, SafetyStop
 from hil.pilot import full
-from hil.pilot.breakaway import broke_free, narrowed, raised, resting_on_stop
+from hil.pilot.breakaway import FrictionWindow, broke_free, narrowed, raised, resting_on_stop
 from hil.pilot.options import PilotOptions
 from hil.pilot.search import Search
 from hil.pilot.seen import Seen
 from hil.pilot.steps import Played, Step, tells_of_the_arm
+from hil.plan.plan import Plan
 from hil.runs.run_folder import RunFolder
 from tests.support import recorded_arm
 from tests.support.edits import replaced
@@ -170,6 +172,67 @@ def test_without_any_torque_that_is_safe_in_the_whole_range_it_begins_between_na
         assert np.ptp(joint.position_limit) < 0.5 * np.ptp(wide.position_limit)
 
 
+class Near(Held):
+    """A player of an arm that, with torques above `most` (joints,) [N m], exceeds its position limits."""
+
+    most = np.array([np.inf, np.inf])
+
+    def play(self, config: Config, folder: object, name: str, found: object, arms: object) -> Played:
+        played = super().play(config, folder, name, found, arms)
+        low, high = np.array([joint.position_limit for joint in load_config(config.path).joints]).T
+        over = played.step.peak_torque > self.most
+        seen = np.stack((0.5 * (low + high), np.where(over, high + 0.01, 0.5 * (low + high)), 0.0 * low))
+        stop = SafetyStop("Elbow is at ...", Cause.POSITION) if over.any() else played.error
+        return replace(played, step=replace(played.step, seen=seen, ended=str(stop or "")), error=stop)
+
+
+def careful(config: Config, tmp_path: Path, player: Held, safe: Sequence[float]) -> Search:
+    """A search in which only the torques `safe` (joints,) [N m] are safe for all plausible arms."""
+    search = searched(config, tmp_path, player)
+
+    def amplitude(config: Config, share: float, plan: Plan | None = None) -> Amplitude:
+        return search._with(config, with_peaks(config, np.array(safe)) if plan is None else plan, np.array(safe))
+
+    search.amplitude = amplitude  # type: ignore[method-assign]
+    return search
+
+
+@pytest.mark.parametrize("friction", [0.7, 1.2, 2.5])
+def test_no_run_repeats_a_torque_with_which_a_joint_stood_still(
+    config: Config, tmp_path: Path, friction: float
+) -> None:
+    """Although no larger torque is safe for all plausible arms, as for a joint that rests near a limit."""
+    safe = np.array([0.2, 0.1])
+    player = Near([0.0, friction * safe[1]])
+    search = careful(config, tmp_path, player, safe.tolist())
+    search.swing = np.array([0.3, 0.3])  # both joints have already moved in a run with more torque
+    _, found = search.find()
+    elbow = np.array(player.torques)[:, 1]
+    stood = elbow[elbow <= player.friction[1]]
+    assert len(set(stood.tolist())) == len(stood), "no repetition"
+    assert player.friction[1] < found.peak_torque[1] <= OPTIONS.breakaway_raise * max(player.friction[1], safe[1])
+    width = np.ptp(config.joints[1].position_limit)
+    tried: set[float] = set()
+    for torque, each in zip(elbow.tolist(), player.configs, strict=True):
+        is_first, is_narrow = torque not in tried, np.ptp(each.joints[1].position_limit) < width
+        assert is_narrow == (is_first and torque > safe[1]), "more than the safe torque is tried between narrow limits"
+        tried.add(torque)
+
+
+@pytest.mark.parametrize("most", [1.25, 1.4, 1.7])
+def test_a_joint_that_either_stands_still_or_exceeds_a_limit_ends_the_search(
+    config: Config, tmp_path: Path, most: float
+) -> None:
+    player = Near([0.0, most * 0.1])
+    player.most = np.array([np.inf, most * 0.1])
+    search = careful(config, tmp_path, player, [0.2, 0.1])
+    search.swing = np.array([0.3, 0.3])
+    with pytest.raises(ExperimentError, match=r"'elbow'.* stood still with .* exceeded a limit with .* N m\. At rest"):
+        search.find()
+    assert len(player.torques) <= 8
+    assert len({torque[1] for torque in player.torques}) == len(player.torques), "no repetition"
+
+
 def test_stopping_a_joint_that_broke_free_does_not_cap_the_torque(config: Config, tmp_path: Path) -> None:
     search = searched(config, tmp_path, Held([0.0, 0.0]))
     pose = np.array(config.arm.rest_pose)
@@ -268,6 +331,24 @@ def test_motion_that_never_repeats_ends_the_identification(config: Config, tmp_p
     with pytest.raises(SafetyStop, match="does not repeat"):
         full._full(search, config, found)
     assert search.play.call_count == OPTIONS.max_unlike_runs
+
+
+def test_a_joint_that_stands_still_after_it_moved_counts_as_still(config: Config) -> None:
+    zeros, torque = np.zeros((4, 2)), np.array([0.2, 0.1])
+    error = DidNotMove("Elbow moved by only 0.0031 rad in a whole period: it is stuck")
+    error.joint = 1
+    played = Played(Step("Step 4", torque, zeros, zeros, zeros, str(error)), None, "", error)
+    window = FrictionWindow.unknown(2).after(config, played, np.array([0.3, 0.3]))
+    assert window.still.tolist() == [0.0, 0.1] and window.enough.tolist() == [0.2, np.inf]
+    window = window.after(config, replace(played, error=None), np.array([0.3, 0.3]))
+    assert window.still.tolist() == [0.0, 0.0], "the same torque has moved it since"
+
+
+def test_a_limit_that_was_not_narrowed_is_one_of_the_configuration(config: Config) -> None:
+    low, _ = config.joints[0].position_limit
+    near = narrowed(config, np.array([low + 0.01, 0.0]), SHOULDER, OPTIONS)
+    seen = np.array([[low - 0.01, 0.0], [low + 0.02, 0.0], [1.0, 0.0]])
+    assert not broke_free(config, near, seen).any()
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from hil.errors import Cause, ConfigError, DidNotMove, NoSafeTorque, NotSettled,
 from hil.estimator.chain.excitation import path_design
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.estimator.chain.excitation.path_design import Design
+from hil.estimator.errors import ExcitationError
 from hil.pilot import chain_search, chain_shares
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import RESERVE, Paths, Reserve, chain_config
@@ -361,6 +362,34 @@ def test_a_reserve_always_leaves_some_range() -> None:
     config = chain_config(leg())
     with pytest.raises(NoSafeTorque, match="no position range is left"):
         Paths.of(config, ChainBelief.prior(config).torque, replace(RESERVE, position=0.5))
+
+
+def test_a_description_that_is_too_heavy_for_its_motors_is_named_as_the_cause() -> None:
+    config = chain_config(leg())
+    thought = ChainBelief.prior(config).torque
+    with pytest.raises(
+        NoSafeTorque,
+        match=r"According to leg\.urdf, gravity alone requires more torque .* Check the masses .* Otherwise, widen",
+    ):
+        Paths.of(config, replace(thought, rigid=100.0 * thought.rigid))
+
+
+@pytest.mark.parametrize("doubts", [(), ('leg.urdf: link "shank" is bulky.', "leg.urdf: another.")])
+def test_a_doubtful_description_is_named_as_a_possible_cause(
+    doubts: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = chain_config(leg())
+    thought = ChainBelief.prior(config).torque
+    monkeypatch.setattr("hil.pilot.chain_paths.doubted_inertias", lambda _: doubts)
+    monkeypatch.setattr(path_design.PathDesigner, "design", Mock(side_effect=ExcitationError("no path is allowed")))
+    with pytest.raises(NoSafeTorque) as refused:
+        Paths.of(config, thought, replace(RESERVE, speed=0.59))
+    said = str(refused.value).partition("no path is allowed. ")[2]
+    if doubts:
+        expected = "The description may be the cause (`hil check` lists 1 more): " + doubts[0] + " Otherwise, widen"
+    else:
+        expected = "Widen position_limit"
+    assert said.startswith(expected)
 
 
 def wider(paths: Paths, times: float) -> Paths:

@@ -16,18 +16,19 @@ import hil
 from hil.cli.views.result_table import print_result
 from hil.config.schema import Config, load_config
 from hil.dry_run import stopping_distance
-from hil.errors import ConfigError
+from hil.errors import Cause, ConfigError, DidNotMove, ExperimentError, NotSettled, SafetyStop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.fakes.servo.registers import Register
 from hil.fakes.servo.servo import EmulatedServo
-from hil.pilot import identify_in_steps
+from hil.pilot import identify_in_steps, steps
 from hil.pilot.belief import prior_belief
 from hil.pilot.search import Search
 from hil.pilot.steps import Played, Step
 from hil.report.page import make_page
 from hil.report.run_data import RunData
 from hil.results.result import SettledResult
+from hil.runs.recording import sample_type
 from hil.runs.run_folder import RunFolder
 from tests.support.dry_runs import worst_relative_std
 from tests.support.edits import replaced
@@ -195,3 +196,31 @@ def test_an_earlier_run_needs_a_pilot_to_start_from(in_steps: Any) -> None:
     _, path, _ = in_steps
     with pytest.raises(ConfigError, match=r"pilot \(experiment\.pilot = true\), but this file gives peak_torque"):
         hil.identify("fake_two_link", start_from=path)
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (
+            DidNotMove("Joint 'elbow' moved by only 0.0046 rad in a whole period: it is stuck. Move it by hand."),
+            "period.",
+        ),
+        (NotSettled("After 5 periods of 4 s the motion is still drifting: 4 % of its RMS. Check it."), "drifting."),
+        (SafetyStop("Joint 'elbow' is at 2 rad, outside its position limit [-1, 1].", Cause.POSITION), "[-1, 1]."),
+    ],
+)
+def test_a_run_says_in_one_sentence_why_it_ended_early(
+    first_time: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: ExperimentError, said: str
+) -> None:
+    """Not what to do about it: the pilot does that itself."""
+    samples = np.zeros(0, dtype=sample_type(2))
+    monkeypatch.setattr(steps, "punctual", Mock(side_effect=error))
+    monkeypatch.setattr(steps, "load_samples", lambda *_: samples)
+    monkeypatch.setattr(steps, "peaks_of", lambda *_: np.zeros((6, 2)))
+    told: list[str] = []
+    found = Mock(peak_torque=np.zeros(2), prediction=Mock(median=np.zeros((6, 2)), quantile=np.zeros((6, 2))))
+    player = steps.Player(first_time.path, lambda _: None, told.append)
+    played = player.play(first_time, RunFolder.create(tmp_path / "run", first_time), "Step 4", found, Mock())
+    (line,) = [each for each in told if "ended early" in each]
+    assert line.startswith("Step 4 ended early: ") and line.endswith(said)
+    assert line.count(". ") == 0 and played.error is error
