@@ -204,6 +204,7 @@ class Servo:
     ) -> _T:
         """Run one SDK exchange until it succeeds, at most `attempts` times; turn result codes into exceptions."""
         late, others = False, set[int]()
+        late_before = self.port.late_replies
         for left in reversed(range(attempts)):
             self._sdk.heard = -1
             self._sdk_port.patience = PATIENCE_S * self.port.growth ** (attempts - 1 - left)
@@ -226,7 +227,7 @@ class Servo:
                 "are mixed up. Check that every servo has its own ID, and whether a device on the bus changes replies."
             )
         if result == COMM_RX_TIMEOUT:
-            check = f"{LATE} If that does not help, check" if self.port.late_replies else "Check"
+            check = f"{LATE} If that does not help, check" if self.port.late_replies > late_before else "Check"
             raise NoReply(
                 f"{self.title} does not answer at {self.port.baud} baud on {self.port.url} ({what}). {check} its "
                 "supply and its cable; `hil scan` shows whether it has another ID or baud rate."

@@ -160,7 +160,7 @@ def setup(
         raise typer.BadParameter("--json cannot ask for confirmation: add --yes.")
     opened = open_port(port_url(port), baud)
     try:
-        recover_all(opened, servo_id, lambda text: print(text, file=sys.stderr))
+        all_restored = recover_all(opened, servo_id, lambda text: print(text, file=sys.stderr))
         servo = open_servo(opened, servo_id)
         confirm: Callable[[str], bool] = (lambda _: True) if yes else agrees
         changes = set_up(
@@ -174,3 +174,5 @@ def setup(
     finally:
         opened.close()
     print(json.dumps(changed(changes))) if json_only else print_changes(changes, port)
+    if not all_restored:
+        raise typer.Exit(1)

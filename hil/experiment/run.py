@@ -40,7 +40,8 @@ from hil.setup.lying import from_where_it_lies, moved_without_torque, said_of_th
 from hil.setup.pairs import mirrored_pairs
 from hil.setup.realtime import on_time
 from hil.setup.session.end_of_session import about_torque, confirmed_later
-from hil.setup.session.servo_session import REBOOT_S, has_moved, lay_at_start, servo_session, settings_at_start
+from hil.setup.session.killed_run import REBOOT_S
+from hil.setup.session.servo_session import has_moved, lay_at_start, servo_session, settings_at_start
 from hil.setup.unmoved import Lies, has_stirred, refuse_moved, wait_for_rest, where_it_lies
 
 __all__ = ["run_experiment"]

@@ -17,7 +17,8 @@ from hil.next_step import command
 from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.setup.finding import Finding, Level
 from hil.setup.servo_settings import POWER_CYCLE
-from hil.setup.session.killed_run import half_let_down, left_behind, recover
+from hil.setup.session.killed_run import half_let_down, left_behind, recover_patiently
+from hil.setup.session.leftovers import not_restored
 from hil.setup.session.settings_file import DamagedSettings
 
 _WARM_BELOW_LIMIT_C = 15
@@ -68,12 +69,15 @@ def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding
     """Restore settings that a killed run could not restore."""
     what = "settings from an earlier run"
     try:
-        restored = recover(servo, config.url)
+        restored = recover_patiently(servo, config.url)
+    except KeyboardInterrupt as stopped:
+        stopped.add_note(not_restored(servo.port))
+        raise
     except DamagedSettings as error:
         yield Finding(Level.STOP, str(joint), what, "cannot be read", str(error))
         return
     except DriverError as error:
-        yield Finding(Level.WARNING, str(joint), what, "cannot be restored", str(error))
+        yield Finding(Level.STOP, str(joint), what, "cannot be restored", str(error))
         return
     if written := ", ".join(restored.written):
         yield Finding(Level.OK, str(joint), what, f"that run ended before restoring them; restored now: {written}")

@@ -7,14 +7,17 @@ Such a register is reported but not restored, since the user may have wanted the
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from hil.drivers.errors import TorqueHeld
+from hil.drivers.errors import NoReply, TorqueHeld
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import attainable, put_back, read_settings
 from hil.drivers.servo import Servo
 from hil.setup.session import settings_file
 from hil.setup.session.settings_file import Kept
 
-__all__ = ["Left", "Restored", "left_behind", "recover", "what_is_left"]
+__all__ = ["REBOOT_S", "Left", "Restored", "left_behind", "recover", "recover_patiently", "what_is_left"]
+
+REBOOT_S = 0.6
+"""A servo that does not answer may be booting, so it is tried again after this time [s]."""
 
 _MODE, _CURRENT_LIMIT = "Operating Mode", "Current Limit"
 
@@ -154,6 +157,15 @@ class Restored:
     written: list[str] = field(default_factory=list)
     others: str = ""
     was_on: bool = False
+
+
+def recover_patiently(servo: Servo, port: str) -> Restored:
+    """Like `recover`, but if the servo stops answering, try once more after the time that it takes to boot."""
+    try:
+        return recover(servo, port)
+    except NoReply:
+        servo.port.clock.wait_until(servo.port.clock.now() + REBOOT_S)
+        return recover(servo, port)
 
 
 def recover(servo: Servo, port: str) -> Restored:

@@ -20,7 +20,7 @@ from hil.setup.session.killed_run import (
     Restored,
     half_let_down,
     is_left_on,
-    recover,
+    recover_patiently,
     switch_off_left,
     what_is_left,
 )
@@ -126,11 +126,11 @@ def _with_leftovers(port: Port, found: Found) -> Found:
     return found if left is None else found.with_trouble(left.trouble)._replace(left=left.told, restore=left.restore)
 
 
-def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> None:
+def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> bool:
     """Restore every servo on this port that a killed run left unrestored and that answers at the port's baud rate.
 
     Torque that killed runs left on is first switched off on all servos. A servo on which another program has switched
-    torque on since is left as it is.
+    torque on since is left as it is. Returns whether every servo that answered is restored.
 
     needed: ID of the servo that the caller needs. say: receives a message for each servo that was restored or could
     not be. Raises PortLost and, once all other servos have been restored, the error of `recover` for the needed servo
@@ -138,21 +138,20 @@ def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> None:
     """
     failed: dict[Servo, DriverError] = {}
     was_on: dict[Servo, bool] = {}
-    to_restore = _on_file(port)
-    for servo in to_restore:
+    for servo in _on_file(port):
         try:
             was_on[servo] = _switched_off(servo)
-        except PortLost as lost:
-            lost.add_note(_cut_short(to_restore))
+        except (PortLost, KeyboardInterrupt) as ended:
+            ended.add_note(not_restored(port))
             raise
         except DriverError as error:
             failed[servo] = error
-    for number, (servo, is_cut) in enumerate(was_on.items()):
+    for servo, is_cut in was_on.items():
         try:
-            if said := _restored(recover(servo, port.url), is_cut):
+            if said := _restored(recover_patiently(servo, port.url), is_cut):
                 say(f"{servo.title}: {said}")
-        except PortLost as lost:
-            lost.add_note(_cut_short([*list(was_on)[number:], *failed]))
+        except (PortLost, KeyboardInterrupt) as ended:
+            ended.add_note(not_restored(port))
             raise
         except DriverError as error:
             failed[servo] = error
@@ -164,14 +163,15 @@ def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> None:
     for servo, why in failed.items():
         if servo not in unreached:
             raise why
+    return not failed.keys() & was_on.keys()
 
 
-def _cut_short(servos: Sequence[Servo]) -> str:
-    """Say that the port was lost before these servos were restored."""
-    files = "".join(f" {servo.title}{_file_of(servo)}." for servo in servos)
+def not_restored(port: Port) -> str:
+    """State which servos on this port have not been restored; the message of a command that ended while restoring."""
+    left = "".join(f" {servo.title}{_file_of(servo)}." for servo in _on_file(port))
     return (
-        f"Not restored after an earlier run, and perhaps with TORQUE ON:{files} Hold the arm or cut its power. The "
-        "next hil check, record, identify or setup on this port restores them."
+        f"Not restored after an earlier run, and perhaps with TORQUE ON:{left} Hold the arm or cut its power. The next "
+        "hil check, record, identify or setup on this port restores them."
     )
 
 

@@ -27,6 +27,7 @@ from hil.errors import ExperimentError
 from hil.setup.changed_settings import Settings, settings_now
 from hil.setup.session import settings_file
 from hil.setup.session.end_of_session import end_with, telling_of_torque
+from hil.setup.session.killed_run import REBOOT_S
 from hil.setup.session.others import others_on_the_bus
 from hil.setup.session.saved_settings import SavedSettings
 from hil.setup.session.unrestored import unrestored
@@ -46,9 +47,6 @@ Say = Callable[[str], None]
 
 _MOST_CUTS = 5
 """Largest number of times that torque is cut again at the end if another program switches it on."""
-
-REBOOT_S = 0.6
-"""A servo that does not answer at the end may be booting, so it is tried again after this time [s]."""
 
 COUNT_DOWN_S = 5.0
 """Time from the warning that the arm will move again, after a stopped run, until torque is switched on [s]."""

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import signal
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -14,10 +15,10 @@ import serial
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import TorqueHeld, TorqueNotOff
-from hil.fakes.bus.faults import Fault
+from hil.fakes.bus.faults import Fault, FaultKind
 from hil.setup.finding import Level
 from hil.setup.preflight import check_arm
-from hil.setup.session import settings_file
+from hil.setup.session import killed_run, settings_file
 from hil.setup.session.servo_session import servo_session
 from tests.support.bench import SHORT, Arm, Bench
 from tests.support.command_line import hil
@@ -123,6 +124,78 @@ def test_a_cable_lost_while_setup_restores_leaves_no_doubt_about_torque(
     torque = next(line for line in said.splitlines() if "perhaps with TORQUE ON" in line)
     assert [number for number in (1, 2) if f"ID {number} (" in torque] == list(left)
     assert "hil check, record, identify or setup on this port restores them" in torque
+
+
+def silent_while_restoring(bench: Bench, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    """Silence servo 1 for a while when the first setting of an earlier run is restored."""
+    write = type(bench.port).write
+    begun: list[bool] = []
+
+    def silencing(data: bytes) -> int:
+        is_setting = data[7] == 3 and data[8] in (11, 38)  # Operating Mode, Current Limit
+        if is_setting and data[4] == 1 and not begun:
+            begun.append(True)
+            bus = bench.port.bus
+            bus.faults.add(Fault(kind=FaultKind.SILENT_SERVO, servo=1, at=bus.time, duration=seconds))
+        return write(bench.port, data)
+
+    monkeypatch.setattr(bench.port, "write", silencing)
+
+
+@pytest.mark.parametrize("command", ["setup", "check"])
+def test_a_servo_that_reboots_while_it_is_restored_is_tried_again(
+    command: str, arm: Arm, bench: Bench, kill: Any, state_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = arm(SHORT)
+    kill(config)
+    silent_while_restoring(bench, monkeypatch, 0.3)
+    words = ["setup", config.url, "--id", 2, "--yes"] if command == "setup" else ["check", config.path]
+    assert hil(*words) == 0
+    assert bench.changed() == [] and list(state_folder.glob("*.json")) == []
+
+
+@pytest.mark.parametrize("command", ["setup", "check"])
+def test_a_command_that_leaves_a_servo_unrestored_ends_with_an_error(
+    command: str,
+    arm: Arm,
+    bench: Bench,
+    kill: Any,
+    state_folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = arm(SHORT)
+    kill(config)
+    silent_while_restoring(bench, monkeypatch, 20.0)
+    words = ["setup", config.url, "--id", 2, "--yes"] if command == "setup" else ["check", config.path]
+    assert hil(*words) == 1
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert "not yet restored after an earlier run" in said or "settings from an earlier run: cannot be restored" in said
+    assert "too late" not in said, "no reply was"
+    assert len(list(state_folder.glob("*.json"))) == 1
+
+
+@pytest.mark.parametrize("command", ["setup", "check"])
+def test_a_signal_while_servos_are_restored_leaves_no_doubt_about_torque(
+    command: str,
+    arm: Arm,
+    bench: Bench,
+    kill: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = arm(SHORT)
+    kill(config)
+
+    def stopped(*_: Any) -> Any:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(killed_run, "put_back", stopped)
+    words = ["setup", config.url, "--id", 2, "--yes"] if command == "setup" else ["check", config.path]
+    assert hil(*words) == 128 + signal.SIGTERM
+    said = capsys.readouterr().err
+    torque = next(line for line in said.splitlines() if "perhaps with TORQUE ON" in line)
+    assert [number for number in (1, 2) if f"ID {number} (" in torque] == [1, 2]
 
 
 def test_a_pipe_in_place_of_a_settings_file_is_a_damaged_file(
