@@ -5,7 +5,11 @@ from other modules could therefore be older than their sources. So the cache is 
 """
 
 import hashlib
+import os
+import tempfile
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from stat import S_ISDIR
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
@@ -17,13 +21,43 @@ PACKAGE = __name__.split(".", maxsplit=1)[0]
 
 def compiled(function: Callable[..., Any], **options: Any) -> Any:
     """Compile `function` to run without the GIL, and cache the result on disk until its code or constants change."""
-    dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+    dispatcher = _cached(function, nogil=True, error_model="numpy", **options)
     # These attributes of numba are not public. Without a stamp, the cache would only check the date of one file, as
     # numba's own cache does.
     on_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if on_file is not None:
         on_file._source_stamp = code_digest(dispatcher)
     return dispatcher
+
+
+def _cached(function: Callable[..., Any], **options: Any) -> Any:
+    """Compile with a cache on disk, wherever this user may write; without one if that is nowhere."""
+    compile_it: Any = numba.njit
+    try:
+        return compile_it(cache=True, **options)(function)
+    except RuntimeError:  # neither next to the source file nor in the user's cache folder, as in many containers
+        settings: Any = numba.config
+        settings.CACHE_DIR = settings.CACHE_DIR or own_folder()
+    try:
+        return compile_it(cache=bool(settings.CACHE_DIR), **options)(function)
+    except RuntimeError:  # the code is not in a file, as in a zipped wheel
+        return compile_it(**options)(function)
+
+
+def own_folder() -> str:
+    """A folder below the temporary one that only this user may write to; "" if there is none.
+
+    The cache contains code, so another user's folder must not be used.
+    """
+    user = getattr(os, "getuid", int)()
+    folder = Path(tempfile.gettempdir()) / f"hil-compiled-{user}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError:
+        return ""
+    is_own = S_ISDIR(found.st_mode) and found.st_uid == user and not found.st_mode & 0o077
+    return str(folder) if is_own else ""
 
 
 def inner(function: Any, **options: Any) -> Any:

@@ -168,7 +168,7 @@ class ChainWatch:
                 f"{name} {UNLIKE_ANY_ARM} consistent with the prior and the data so far: "
                 f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion."
             )
-            failed = "Its motor or its encoder has failed, or something is pushing or holding it."
+            failed = "Its motor or its encoder has failed, its horn slips, or something is pushing or holding it."
             causes = self._ordered(_DOUBTS, failed)
         raise SafetyStop(said, Cause.UNEXPECTED, causes)
 

@@ -361,7 +361,8 @@ class ModelWatch:
             said = (
                 f"{name} {UNLIKE_ANY_ARM} consistent with the prior and the data so far: "
                 f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "
-                "encoder has failed, something is pushing or holding it, or the arm is not the one described."
+                "encoder has failed, its horn slips, something is pushing or holding it, or the arm is not the one "
+                "described."
             )
         raise SafetyStop(said + self._near_limit(joint, state.position[joint]), Cause.UNEXPECTED)
 

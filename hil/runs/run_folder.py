@@ -359,7 +359,10 @@ class RunFolder:
         path = self.path / "events.jsonl"
         if not path.is_file():
             return ()
-        lines = path.read_text(encoding="utf-8").splitlines()
+        try:
+            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        except OSError as error:
+            raise RunFolderError(f"{path} cannot be read: {error}.") from error
         found = []
         for number, line in enumerate(lines, start=1):
             try:
@@ -416,7 +419,7 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise RunFolderError(f"{path} cannot be read: {error}.") from error
     if not isinstance(value, dict):
         raise RunFolderError(f"{path} is damaged: it is not a JSON object.")

@@ -20,6 +20,8 @@ from hil.drivers.read_back_exchange import ReadBackExchange
 from hil.setup.realtime import on_time
 
 CYCLES = 200
+MOST_LOST = 2
+"""Number of lost replies, out of CYCLES, that do not speak against an exchange mode."""
 SLOW_EVERY = 10
 USUAL = 0.9
 """Fraction of the exchanges that must be fast enough for the reported rate; an experiment needs 80 % of its
@@ -60,7 +62,8 @@ class ExchangeMode:
 
     @property
     def sound(self) -> bool:
-        return self.lost == 0
+        """Whether so few replies were lost that an experiment tolerates it."""
+        return self.lost <= MOST_LOST
 
     @property
     def rate(self) -> float:
@@ -183,7 +186,7 @@ def choose_mode(bus: ServoBus, modes: Sequence[ExchangeMode], rates: Sequence[fl
         return max((rate for rate in rates if RATE_MARGIN * rate <= mode.rate), default=min(rates))
 
     configured = _configured(bus, modes)
-    best = max(modes, key=lambda mode: (-mode.lost, highest(mode), mode is configured))
+    best = max(modes, key=lambda mode: (0 if mode.sound else -mode.lost, highest(mode), mode is configured))
     return best, highest(best)
 
 
@@ -246,6 +249,11 @@ def _measure(bus: ServoBus, goals: Sequence[int], *, fast: bool, one_write: bool
 
 
 def _delayed(used: ExchangeMode, wanted: float) -> str:
+    if used.lost:
+        return (
+            f"{used.lost} of {CYCLES} replies were lost. An experiment tolerates isolated losses, but stops if several "
+            "replies in a row are missing: check cables, supply and termination."
+        )
     if used.longest_s <= 1 / wanted:
         return ""
     return (

@@ -34,7 +34,8 @@ def check_servo(config: Config, joint_config: JointConfig, joint: Joint, servo: 
     try:
         number = servo.ping()
     except NoReply:
-        fix = f"Check supply and cable. `hil scan {config.port.url}` shows whether it has another ID or baud rate."
+        where_to_look = config.path if config.is_fake else config.port.url
+        fix = f"Check supply and cable. `hil scan {where_to_look}` shows whether it has another ID or baud rate."
         yield Finding(Level.STOP, where, "answers", f"nothing at {config.port.baud} baud", fix)
         return
     except PortLost as error:

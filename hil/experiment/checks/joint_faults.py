@@ -228,7 +228,8 @@ class JointFaults:
         return (
             Cause.WRONG_SIGN,
             f"is moving against its command: its motor has taken {self._records[index]['found']:.2f} J out of the arm, "
-            "more than friction can account for. Is its direction reversed, or is something else driving the arm?",
+            "more than friction can account for. Its direction is reversed, its horn slips, or something else is "
+            "driving the arm.",
         )
 
 

@@ -90,6 +90,21 @@ def test_a_rate_is_refused_only_if_it_is_too_high_twice(
     assert not list(measured)
 
 
+@pytest.mark.parametrize(("lost", "refused"), [(2, False), (3, True)])
+def test_isolated_lost_replies_are_a_warning_and_no_reason_to_change_the_file(
+    lost: int, refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used = ExchangeMode(
+        one_write=True, fast=False, median_s=1e-3, usual_s=1e-3, slowest_s=1e-3, longest_s=1e-3, lost=lost
+    )
+    monkeypatch.setattr(bus_rate, "measure_modes", lambda _: [used, replace(used, one_write=False, lost=0)])
+    bus = cast("ServoBus", SimpleNamespace(config=SimpleNamespace(fast_sync_read=False, one_write=True)))
+    report = check_rate(bus, 400.0)
+    assert bool(report.fix) is refused and bool(report.doubt) is not refused
+    assert report.doubt.startswith("" if refused else "2 of 200 replies were lost. An experiment tolerates")
+    assert bus_rate.choose_mode(bus, report.modes, (400.0,))[0].one_write is not refused
+
+
 def test_a_rate_that_only_leaves_the_computer_little_time_is_not_refused(tmp_path: Path) -> None:
     """`hil identify` runs at such a rate, so `hil check` must not call it a blocking problem."""
     path = six_servos(tmp_path, "1_000_000")
