@@ -32,7 +32,7 @@ def report(
 
     print(write_report(run, out))
     shown = [] if png is None and svg is None else figures_of(run)
-    for kind, folder in (("png", png), ("svg", svg)):
+    for kind, folder in (("svg", svg), ("png", png)):  # only the second needs an extra
         if folder is not None:
             print(f"{len(save_pictures(shown, folder, kind))} figures in {folder}")
     if not is_quiet():  # on standard error, so that the page's path stays alone on standard output
