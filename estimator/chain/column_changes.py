@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.column_faults import FACTORS, ColumnCheck, Normal, Solved
+from hil.estimator.chain.column_faults import FACTORS, TIMES, ColumnCheck, Normal, Solved
 from hil.estimator.chain.fit.regression import filtered_torques
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -32,8 +32,7 @@ SAMPLES, FLOOR = 20.0, 0.03
 """Number of independent torque samples of each joint that the cost assumes, and the relative torque residual below
 which smaller residuals are no longer evidence.
 """
-BETTER = 12.0  # smallest decrease in the cost with a change
-APART = 5.0  # smallest difference in the cost between the best change and the best different one
+BETTER = 5.0  # difference in the cost that decides between a change and none, and between two changes
 WELL, NEAR = 0.12, 0.1
 """Largest relative torque residual with a change, and largest squared distance per base parameter between the result
 and the description, in units of the description's uncertainty.
@@ -104,7 +103,10 @@ class Suspected:
 
 @dataclass(frozen=True)
 class _Tried:
+    """An explanation. distance: squared distance between the result and the description, as for `NEAR`."""
+
     cost: float
+    distance: float
     solved: Solved
     change: ColumnChange | None
     """None for no change, or for one that is not a change to columns of angles or to the order of columns."""
@@ -126,18 +128,18 @@ class ColumnSearch:
 
     def suspected(self) -> Suspected | None:
         """Return the change that alone makes torques, motion and description agree; None if there is none."""
-        given, away = self._given, self._given.solved.distance(self.check.prior)
-        if away < LESS:
+        given = self._given
+        if given.distance < LESS:
             return None
         tried = [*self._changed(), *self._otherwise()]
         tried = [each for each in tried if not self.check.dissipates_too_little(each.solved)]
         best = min(tried, key=lambda each: each.cost, default=given)
-        if best.change is None or given.cost - best.cost < BETTER or not self._is_good(best.solved, away):
+        if best.change is None or given.cost - best.cost < BETTER or not self._is_good(best, given):
             return None
         if best.change.kind == "ratio":
             best = self._refined(best, best.change)
-        rivals = [each.cost for each in tried if not _is_same(each.change, best.change)]
-        if min(rivals, default=np.inf) - best.cost < APART or best.change is None:
+        rivals = [each for each in tried if not _is_same(each.change, best.change)]
+        if best.change is None or not all(_is_worse(each, best) for each in rivals):
             return None
         return Suspected(best.change, (best.solved.worst, given.solved.worst))
 
@@ -149,20 +151,16 @@ class ColumnSearch:
     def _given(self) -> _Tried:
         return self._tried(Normal.of(*self._rows), None)
 
-    def _is_good(self, solved: Solved, away: float) -> bool:
-        """Whether a change leaves little of the torque unexplained, and agrees with the description as it should.
-
-        away: squared distance to the description without a change.
-        """
-        distance, prior = solved.distance(self.check.prior), self.check.prior
-        nearer = away - distance >= LESS and away >= CLOSER * distance
-        return nearer and solved.worst < WELL and distance < NEAR * prior.value.size
+    def _is_good(self, best: _Tried, given: _Tried) -> bool:
+        """Whether a change leaves little of the torque unexplained, and agrees with the description as it should."""
+        near = best.distance < NEAR * self.check.prior.value.size
+        return near and best.solved.worst < WELL and _is_nearer(best, given)
 
     def _tried(self, normal: Normal, change: ColumnChange | None, prior: Prior | None = None) -> _Tried:
         prior = prior or self.check.prior
         solved = normal.solved(np.ones(len(normal.torque)), prior)
-        residual = np.log(np.hypot(solved.relative, FLOOR)).sum()
-        return _Tried(float(SAMPLES * residual + 0.5 * solved.distance(prior)), solved, change)
+        residual, distance = np.log(np.hypot(solved.relative, FLOOR)).sum(), solved.distance(prior)
+        return _Tried(float(SAMPLES * residual + 0.5 * distance), distance, solved, change)
 
     def _with(self, change: ColumnChange) -> _Tried:
         """Evaluate a change; raises EstimationError for angles that no joint has."""
@@ -182,18 +180,27 @@ class ColumnSearch:
                 yield self._with(change)
 
     def _otherwise(self) -> Iterator[_Tried]:
-        """Evaluate explanations other than changes: another mount, and one wrong torque constant."""
+        """Evaluate explanations other than changes: another mount, wrong times, and one wrong torque constant."""
         gravity = self.check.model.base.chain.gravity
         for direction in directions_of_gravity(gravity):
             base = BaseParameters.of(replace(self.check.model.base.chain, gravity=direction))
             rows = _moving(self.check.recordings, ChainModel(base), self.check)
             yield self._tried(Normal.of(*rows), None, Prior.of(base, self.links))
+        for slower in TIMES.tolist():
+            with suppress(EstimationError):
+                yield self._slower(slower)
         columns, torque = self._rows
         normal = Normal.of(columns, torque)
         for joint in range(len(torque)):
             for factor in FACTORS.tolist():
                 scaled = np.where(np.arange(len(torque)) == joint, factor, 1.0)
                 yield self._tried(normal.driven_by(columns, scaled[:, None] * torque), None)
+
+    def _slower(self, factor: float) -> _Tried:
+        """Evaluate times divided by `factor`; raises EstimationError if they cannot be filtered."""
+        changed = [replace(each, time=each.time / factor) for each in self.check.recordings]
+        check = replace(self.check, recordings=changed, cutoff=self.check.cutoff * factor)
+        return self._tried(Normal.of(*_moving(changed, check.model, check)), None)
 
     def _refined(self, best: _Tried, change: ColumnChange) -> _Tried:
         """Refine a ratio, and round it to a ratio of small whole numbers if it is close to one."""
@@ -241,3 +248,12 @@ def _is_same(one: ColumnChange | None, other: ColumnChange | None) -> bool:
     if one is None or other is None:
         return False
     return one == other or (one.kind == "ratio" and replace(one, factor=other.factor) == other)
+
+
+def _is_nearer(one: _Tried, other: _Tried) -> bool:
+    """Whether one explanation agrees with the description so much better that the description decides."""
+    return other.distance - one.distance >= LESS and other.distance >= CLOSER * one.distance
+
+
+def _is_worse(rival: _Tried, best: _Tried) -> bool:
+    return rival.cost - best.cost >= BETTER or (rival.cost > best.cost and _is_nearer(best, rival))
