@@ -120,7 +120,11 @@ def _unit(change: ColumnChange, names: Sequence[str], columns: Columns) -> tuple
 def _keys(change: ColumnChange, columns: Columns) -> list[str]:
     """Return the keys of the columns that change."""
     assert columns.drive is not None  # filled in when the file was read
-    return {"position": ["position"], "torque": [columns.drive], "both": [columns.drive, "position"]}[change.columns]
+    return [key for key in (columns.drive, "position") if change.columns in ("both", _kind(key))]
+
+
+def _kind(key: str) -> str:
+    return "position" if key == "position" else "torque"
 
 
 def _quoted(name: str) -> str:
