@@ -88,7 +88,7 @@ class Late:
 
 
 @dataclass(frozen=True)
-class _Solved:
+class Solved:
     value: Array
     std: Array
     relative: Array
@@ -131,9 +131,9 @@ class ColumnCheck:
         return None
 
     @cached_property
-    def _given(self) -> tuple["_Normal", _Solved]:
-        normal = _Normal.of(*self._rows)
-        return normal, self._solved(normal)
+    def _given(self) -> tuple["Normal", Solved]:
+        normal = Normal.of(*self._rows)
+        return normal, self.solved(normal)
 
     @cached_property
     def _rows(self) -> tuple[Array, Array]:
@@ -142,20 +142,20 @@ class ColumnCheck:
     def _filtered(self, recordings: Sequence[Recording], late: float) -> tuple[Array, Array]:
         return filtered_torques(recordings, self.model, self.cutoff, self.delay - late)
 
-    def _normal(self, recordings: Sequence[Recording]) -> "_Normal":
-        return _Normal.of(*self._filtered(recordings, 0.0))
+    def _normal(self, recordings: Sequence[Recording]) -> "Normal":
+        return Normal.of(*self._filtered(recordings, 0.0))
 
-    def _solved(self, normal: "_Normal") -> _Solved:
+    def solved(self, normal: "Normal") -> Solved:
         return normal.solved(np.ones(self.model.joints), self.prior)
 
     @property
     def suspicious(self) -> bool:
         """Whether inverse dynamics leaves so much torque unexplained that a search for mistakes is worthwhile."""
-        return self._given[1].worst > SUSPICIOUS or self._dissipates_too_little(self._given[1])
+        return self._given[1].worst > SUSPICIOUS or self.dissipates_too_little(self._given[1])
 
     def reversed_columns(self) -> Reversed | None:
         """The reversal that explains the recordings much better than the signs as given."""
-        given, impossible = self._given[1], self._dissipates_too_little(self._given[1])
+        given, impossible = self._given[1], self.dissipates_too_little(self._given[1])
         joints = self.model.joints
         tried: list[tuple[int, float, float, Signs]] = []
         for position in _turned(joints):
@@ -164,7 +164,7 @@ class ColumnCheck:
             for torque in product((1, -1), repeat=joints):
                 signs = Signs(torque, position)
                 found = normal.solved(np.array(torque, dtype=float), self.prior)
-                if signs.reversed_columns and not self._dissipates_too_little(found):
+                if signs.reversed_columns and not self.dissipates_too_little(found):
                     tried.append((len(signs.reversed_columns), found.distance(self.prior), found.worst, signs))
         least = min((worst for _, _, worst, _ in tried), default=np.inf)
         tried = sorted((each for each in tried if each[2] <= AS_WELL * least), key=lambda each: each[:2])
@@ -187,8 +187,8 @@ class ColumnCheck:
                 (columns, torque, "positions"),
                 (columns, torque[order], "torques and positions"),
             ):
-                found = self._solved(_Normal.of(Y, tau))
-                if not self._dissipates_too_little(found):
+                found = self.solved(Normal.of(Y, tau))
+                if not self.dissipates_too_little(found):
                     tried.append((found.worst, pair, said))
         worst, pair, said = min(tried, default=(np.inf, (0, 0), ""))
         return Swapped((worst, given), pair, said) if worst < min(CLEAR * given, WELL) else None
@@ -198,9 +198,9 @@ class ColumnCheck:
         (Y, torque), (normal, given) = self._rows, self._given
         every = {late: self._filtered(self.recordings, late)[1] for late in DELAYS.tolist()}
 
-        def delayed(joints: Mask) -> tuple[_Solved, float]:
+        def delayed(joints: Mask) -> tuple[Solved, float]:
             tried = {
-                late: self._solved(normal.driven_by(Y, np.where(joints[:, None], tau, torque)))
+                late: self.solved(normal.driven_by(Y, np.where(joints[:, None], tau, torque)))
                 for late, tau in every.items()
             }
             late = min(tried, key=lambda each: tried[each].misfit)
@@ -261,7 +261,7 @@ class ColumnCheck:
         except EstimationError:
             return np.inf
 
-    def _dissipates_too_little(self, found: _Solved) -> bool:
+    def dissipates_too_little(self, found: Solved) -> bool:
         """Whether more friction terms are significantly negative than significantly positive, or all terms of one joint
         are significantly negative.
         """
@@ -272,7 +272,7 @@ class ColumnCheck:
 
 
 @dataclass(frozen=True)
-class _Normal:
+class Normal:
     """Normal equations of each joint's torques.
 
     squares: products of the columns (joints, names, names). products: products of columns and torque (joints, names).
@@ -285,17 +285,17 @@ class _Normal:
     rows: int
 
     @classmethod
-    def of(cls, columns: Array, torque: Array) -> "_Normal":
+    def of(cls, columns: Array, torque: Array) -> "Normal":
         """Form the equations of a regressor (joints, rows, names) and torques (joints, rows)."""
         rows = torque.shape[1]
         squares = np.stack([Y.T @ Y for Y in columns]) / rows
         return cls(squares, *_driven(columns, torque), rows)
 
-    def driven_by(self, columns: Array, torque: Array) -> "_Normal":
+    def driven_by(self, columns: Array, torque: Array) -> "Normal":
         """Return the equations for other torques; `columns` is the same regressor as in `of`."""
-        return _Normal(self.squares, *_driven(columns, torque), self.rows)
+        return Normal(self.squares, *_driven(columns, torque), self.rows)
 
-    def solved(self, factors: Array, prior: Prior) -> _Solved:
+    def solved(self, factors: Array, prior: Prior) -> Solved:
         """Solve with each joint's torque multiplied by its factor (joints,)."""
         level = self.torque * factors**2
         left, products = level, self.products * factors[:, None]
@@ -311,7 +311,7 @@ class _Normal:
             value = inverse @ (product_ / norm) / norm
             explained = 2.0 * products @ value - np.einsum("i,jik,k->j", value, self.squares, value)
             left = np.maximum(level - explained, 1e-8 * level)
-        return _Solved(value, np.sqrt(np.maximum(np.diag(inverse), 1e-300)) / norm, np.sqrt(left / level))
+        return Solved(value, np.sqrt(np.maximum(np.diag(inverse), 1e-300)) / norm, np.sqrt(left / level))
 
 
 def _driven(columns: Array, torque: Array) -> tuple[Array, Array]:

@@ -12,10 +12,11 @@ from hil.config.recording import RecordingConfig
 from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
-from hil.errors import ConfigError
+from hil.errors import ConfigError, CsvError
 from hil.estimation.chain_estimate import chain_facts
 from hil.estimation.slips.sticking import sticking_joints
 from hil.estimation.torque_constants import contradictions, ratios_of
+from hil.estimation.unsettled.chain_changes import changed_columns
 from hil.estimation.unsettled.chain_slips import late_torque, refuse_chain_slips, torques_apart
 from hil.estimation.unsettled.chain_verdict import FITTED_SHARE, chain_verdict
 from hil.estimator.arrays import Array
@@ -73,10 +74,15 @@ def estimate_chain_recordings(
     )
     check = ColumnCheck.of(recordings, ChainModel(base), prior)
     mounted = better_gravity_recorded(recordings, model, arm.parameters)
-    refuse_chain_slips(check, config.joint_names or (), source, mounted)
+    changed = changed_columns(check, arm, config.columns)
+    if changed is None:
+        refuse_chain_slips(check, config.joint_names or (), source, mounted)
+    elif changed.is_useless:
+        raise CsvError(f"{source}: {changed.refusal}")
     names = [joint.name for joint in arm.joints]
-    late = late_torque(check, names, all(each.between == "held" for each in recordings))
-    contradictory = () if model.torque_scale or late else torques_apart(check, names)
+    is_sound = changed is None  # as given, wrong columns would seem late, and of the wrong scale
+    late = late_torque(check, names, all(each.between == "held" for each in recordings)) if is_sound else ()
+    contradictory = () if model.torque_scale or late or not is_sound else torques_apart(check, names)
     found = _identified(recordings, model, prior, bool(contradictory))
     model = found.model
     foretold = _held_out(recordings, model, prior)
@@ -110,7 +116,8 @@ def estimate_chain_recordings(
             contradictory,
             late,
             _sticking(recordings),
-            None if mounted is None else mounted.gravity,
+            None if mounted is None or changed is not None else mounted.gravity,
+            changed,
         ),
         warnings=doubted_inertias(arm),
         timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),

@@ -8,6 +8,7 @@ from hil.description.arm import ArmDescription
 from hil.estimation.chain_estimate import stopped_short, vague
 from hil.estimation.chain_mount import MountDoubt, mass_on_the_other_side, mounted_otherwise
 from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
+from hil.estimation.unsettled.chain_changes import ChangedColumns
 from hil.estimator.arrays import Array
 from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -38,24 +39,31 @@ def chain_verdict(
     late: Sequence[str] = (),
     sticking: Sequence[int] = (),
     gravity: Array | None = None,
+    changed: ChangedColumns | None = None,
 ) -> Verdict:
     """The verdict, with reasons.
 
     foretold: relative torque error on the last part of the recordings (joints,); None without one. contradictory, late:
     sentences about torques that contradict each other in the regression, or are logged late. sticking: joints that
-    stick, numbered from 0. gravity: see `better_gravity_recorded`.
+    stick, numbered from 0. gravity: see `better_gravity_recorded`. changed: the mistake in the columns, if it is known;
+    advice that assumes sound columns is then withheld.
     """
     names = found.model.base.names
     weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
     explained = _is_explained(found)
-    mount = _doubted_mount(found, arm, prior, gravity, explained)
+    mount = (
+        _doubted_mount(found, arm, prior, gravity, explained)
+        if changed is None
+        else MountDoubt("with care" if explained else "no", changed.said(arm.path.name), changed.remedy)
+    )
+    cause = _cause(gravity, changed)
     judgements = (
-        *(_of_residual(found, arm, gravity) if found.simulated else (_AS_MEASURED,)),
-        _of_prediction(foretold, arm, explained, gravity is not None),
-        *_of_values(found, prior),
-        (contradicted(found.conflicts, explained), conflict_sentences(found.conflicts, explained)),
+        *(_of_residual(found, arm, cause) if found.simulated else (_AS_MEASURED,)),
+        _of_prediction(foretold, arm, explained, bool(cause)),
+        *_of_values(found, prior, bool(cause)),
+        (contradicted(found.conflicts, explained), () if cause else conflict_sentences(found.conflicts, explained)),
         *_of_torques(found, arm, contradictory, late),
-        _of_convergence(found, arm, sticking),
+        _of_convergence(found, arm, () if cause else sticking),
         ("", ()) if mount is None else (mount.at_most, mount.said),
     )
     trust: Trust = "yes"
@@ -82,7 +90,14 @@ def _is_explained(found: RecordedChain) -> bool:
     )
 
 
-def _of_residual(found: RecordedChain, arm: ArmDescription, gravity: Array | None) -> Iterator[Judgement]:
+def _cause(gravity: Array | None, changed: ChangedColumns | None) -> str:
+    """Say what is wrong, if the verdict names it; "" if it does not. gravity: see `better_gravity_recorded`."""
+    if changed is not None:
+        return "the columns are not as configured"
+    return "" if gravity is None else "the arm is not mounted as configured"
+
+
+def _of_residual(found: RecordedChain, arm: ArmDescription, cause: str) -> Iterator[Judgement]:
     worst = float(found.residual_over_noise.max())
     joint = arm.joints[int(np.argmax(found.residual_over_noise))].name
     said = f"The largest residual ({joint}) is {worst:.2f} times the noise of that joint's angle."
@@ -91,20 +106,23 @@ def _of_residual(found: RecordedChain, arm: ArmDescription, gravity: Array | Non
         said = (
             "Part of the residual repeats with the motion. This increases standard errors by a factor of up to "
             f"{found.systematic:.1f}, and some values may be wrong by more than their standard errors. "
-            f"{_missing(found.model, gravity)}"
+            f"{_missing(found.model, cause)}"
         )
         yield "with care", (said,)
 
 
-def _of_values(found: RecordedChain, prior: Prior) -> Iterator[Judgement]:
-    """Judge values that come from the description, that are uncertain, or that ended at a bound."""
+def _of_values(found: RecordedChain, prior: Prior, is_cause_known: bool) -> Iterator[Judgement]:
+    """Judge values that come from the description, that are uncertain, or that ended at a bound.
+
+    is_cause_known: whether the verdict names the mistake that distorts them.
+    """
     if found.from_prior:
         of_file = ", ".join(found.from_prior)
         yield "with care", (f"The recordings reveal little about {of_file}: these values come from the URDF.",)
     if said := vague(prior, found.model.base.names, found.std, found.from_prior):
         yield "with care", (said,)
     if found.at_bound:
-        yield "with care", (bound_sentence(found.at_bound),)
+        yield "with care", () if is_cause_known else (bound_sentence(found.at_bound),)
 
 
 def _of_torques(
@@ -135,10 +153,10 @@ def _doubted_mount(
     return mounted_otherwise(arm, opposed, found.model.base.chain.gravity, gravity, explained, is_run=False)
 
 
-def _missing(model: ChainModel, gravity: Array | None) -> str:
-    """Say why part of the motion is unexplained. gravity: see `better_gravity_recorded`."""
-    if gravity is not None:
-        return "The model is incomplete, probably because the arm is not mounted as configured."
+def _missing(model: ChainModel, cause: str) -> str:
+    """Say why part of the motion is unexplained. cause: see `_cause`."""
+    if cause:
+        return f"The model is incomplete, probably because {cause}."
     lags = ', lags that differ by joint (model.drive = "delay_lag")' if model.drive == "delay" else ""
     return (
         "An effect is missing from the model: torque ripple or cogging, play or elasticity of the gears, a cable, "
@@ -147,11 +165,11 @@ def _missing(model: ChainModel, gravity: Array | None) -> str:
 
 
 def _of_prediction(
-    foretold: Array | None, arm: ArmDescription, explained: bool, is_mount_known: bool = False
+    foretold: Array | None, arm: ArmDescription, explained: bool, is_cause_known: bool = False
 ) -> Judgement:
     """The best verdict that the prediction of the last part allows ("" for any), and why.
 
-    is_mount_known: whether the verdict names another mount as the cause.
+    is_cause_known: whether the verdict names the cause.
     """
     if foretold is None:
         return "with care", (
@@ -167,7 +185,7 @@ def _of_prediction(
         ": check which column belongs to which joint, the units and signs of the columns, whether the load changed, "
         "and the description of the arm"
     )
-    check = "" if is_mount_known else check
+    check = "" if is_cause_known else check
     return "no", (said, f'An error above {100 * wrong:.0f} %{unexplained} makes the verdict "no"{check}.')
 
 

@@ -86,7 +86,8 @@ def _estimate_chain(
     """The result for a spatial arm; its URDF is kept next to the result."""
     read = _read(paths, config.columns)
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
-    found = estimate_chain_recordings(read.recordings, config, shown, ", ".join(map(str, paths)))
+    as_read = config.model_copy(update={"columns": read.columns})
+    found = estimate_chain_recordings(read.recordings, as_read, shown, ", ".join(map(str, paths)))
     arm = _arm(read, config)
     assert config.arm.urdf is not None  # checked by the estimate
     jumps = jump_sentences(read.recordings, read.names, read.stepped, tuple(joint.name for joint in arm.joints))

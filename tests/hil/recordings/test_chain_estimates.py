@@ -179,6 +179,29 @@ def test_a_reversed_column_is_refused_before_the_fit(setup: bench.Setup) -> None
         api.estimate("bad.csv", config=described(setup, "held"))
 
 
+def test_exchanged_positions_are_refused_with_the_key_to_set(setup: bench.Setup) -> None:
+    table = np.genfromtxt("arm.csv", delimiter=",", names=True)
+    table["q2"], table["q3"] = table["q3"].copy(), table["q2"].copy()
+    np.savetxt("swapped.csv", table, delimiter=",", header=",".join(table.dtype.names or ()), comments="", fmt="%.9g")
+    second, third = setup.arm.joints[1:3]
+    said = rf'positions of {second} and {third} .* Set position = \["q1", "q3", "q2", "q4"\] in \[columns\]'
+    with pytest.raises(CsvError, match=said):
+        api.estimate("swapped.csv", config=described(setup, "held"))
+
+
+def test_a_zero_that_is_off_is_named_instead_of_effects_that_are_not_there(setup: bench.Setup) -> None:
+    """The verdict advised to correct a link's mass, and to look for backlash and loose screws."""
+    table = np.genfromtxt("arm.csv", delimiter=",", names=True)
+    table["q3"] -= 0.5 * np.pi
+    np.savetxt("turned.csv", table, delimiter=",", header=",".join(table.dtype.names or ()), comments="", fmt="%.9g")
+    verdict = api.estimate("turned.csv", config=described(setup, "linear"), out="turned").verdict
+    assert verdict is not None and verdict.trust == "with care" and verdict.first is not None
+    assert verdict.first.startswith("set zero = [0, 0, 1.5708, 0] in [columns]")
+    said = " ".join(verdict.sentences)
+    assert f"the zero of {setup.arm.joints[2]} seems to be off by 90 degrees" in said
+    assert "backlash" not in said and "correct that link's mass" not in said and "torque ripple" not in said
+
+
 def test_measured_torque_gives_the_regression_and_says_so(setup: bench.Setup) -> None:
     found = api.estimate("arm.csv", config=described(setup, "linear"), out="measured")
     assert "least squares" in found.method
