@@ -1,14 +1,10 @@
-"""Progress shown while the arm moves: on a terminal, a bar and each joint's position and current; in a file or a pipe,
-one line per run. Disabled by -q.
-"""
+"""Progress shown while the arm moves: a bar and each joint's position and current. Disabled by -q."""
 
-import math
 import re
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from threading import Thread
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -103,14 +99,9 @@ class Terminal:
 
     @contextmanager
     def streaming(self, config: Config) -> Iterator[Watch]:
-        """Show a live view of the stream or, if standard error is not a terminal, one line per run. Yields the function
-        to call with each progress report.
-        """
-        if self.console.quiet:
+        """Show a live view of the stream. Yields the function to call with each progress report."""
+        if not self.console.is_terminal or self.console.quiet:
             yield lambda _: None
-            return
-        if not self.console.is_terminal:
-            yield self._announcing(config.experiment.rate)
             return
         bar = _bar(self.console)
         task = bar.add_task("", total=1.0)
@@ -134,23 +125,6 @@ class Terminal:
                 told_at, is_over = time.monotonic(), progress.phase is Phase.COMING_TO_REST
 
             yield watch
-
-    def _announcing(self, rate: float) -> Watch:
-        """A function that has one line written when a run starts. rate: sampling rate [Hz].
-
-        Another thread writes it: the control loop, which calls this function, must not wait for a file or a pipe.
-        """
-        taken = math.inf
-
-        def watch(progress: StreamProgress) -> None:
-            nonlocal taken
-            if progress.taken < taken:
-                torque = ", ".join(f"{peak:.3g}" for peak in progress.peak_torque)
-                line = f"A run starts: peak torque {torque} N m, about {progress.expected / rate:.0f} s."
-                Thread(target=self.say, args=(line,), daemon=True).start()
-            taken = progress.taken
-
-        return watch
 
 
 def _bar(console: Console) -> Progress:

@@ -18,7 +18,7 @@ from hil.estimation.slips.sticking import sticking_joints
 from hil.estimation.torque_constants import contradictions, ratios_of
 from hil.estimation.unsettled.chain_changes import changed_columns
 from hil.estimation.unsettled.chain_slips import late_torque, refuse_chain_slips, torques_apart
-from hil.estimation.unsettled.chain_verdict import FITTED_SHARE, chain_verdict
+from hil.estimation.unsettled.chain_verdict import FITTED_SHARES, chain_verdict
 from hil.estimator.arrays import Array
 from hil.estimator.chain.column_faults import ColumnCheck
 from hil.estimator.chain.model.base_parameters import BaseParameters
@@ -28,7 +28,7 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.mount import better_gravity_recorded
 from hil.estimator.chain.recordings import MotionPiece, RecordedChain, identify_recordings, torque_error
 from hil.estimator.data.recording import Recording
-from hil.estimator.errors import EstimationError
+from hil.estimator.errors import EstimationError, StandstillError
 from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Validation
 from hil.results.result import ShootingResult
 
@@ -85,7 +85,7 @@ def estimate_chain_recordings(
     contradictory = () if model.torque_scale or late or not is_sound else torques_apart(check, names)
     found = _identified(recordings, model, prior, bool(contradictory))
     model = found.model
-    foretold = _held_out(recordings, model, prior)
+    foretold, fitted_share = _held_out(recordings, model, prior)
     linear = len(model.linear_names)
     entries = {
         name: Quantity(float(value), float(std), unit)
@@ -118,6 +118,7 @@ def estimate_chain_recordings(
             _sticking(recordings),
             None if mounted is None or changed is not None else mounted.gravity,
             changed,
+            fitted_share,
         ),
         warnings=doubted_inertias(arm),
         timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),
@@ -175,18 +176,24 @@ def _sticking(recordings: Sequence[Recording]) -> tuple[int, ...]:
     return tuple(sorted(found))
 
 
-def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> Array | None:
-    """Return the relative torque error on the last part of each recording, with parameters fitted to the rest.
+def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> tuple[Array | None, float]:
+    """Return the relative torque error on the last part of each recording, with parameters fitted to the rest, and the
+    fraction that was fitted.
 
-    Returns None if a part is too short or the arm stands still in it.
+    The error is None if a part is too short or a joint stands still in it, whichever fraction is fitted.
     """
-    try:
-        first = [_part(each, 0.0, FITTED_SHARE) for each in recordings]
-        last = [_part(each, FITTED_SHARE, 1.0) for each in recordings]
-        error = torque_error(last, identify_recordings(first, model, prior))
-    except EstimationError:
-        return None
-    return None if np.all(np.isnan(error)) else error
+    for share in FITTED_SHARES:
+        try:
+            first = [_part(each, 0.0, share) for each in recordings]
+            last = [_part(each, share, 1.0) for each in recordings]
+            error = torque_error(last, identify_recordings(first, model, prior))
+        except StandstillError:
+            continue
+        except EstimationError:
+            break
+        if not np.all(np.isnan(error)):
+            return error, share
+    return None, FITTED_SHARES[0]
 
 
 def _part(recording: Recording, start: float, end: float) -> Recording:

@@ -17,11 +17,15 @@ from hil.estimator.chain.mount import LIKELY, SURE, opposed_moments
 from hil.estimator.chain.recordings import RecordedChain
 from hil.estimator.models.bounds import bound_sentence
 from hil.estimator.models.conflicts import Trust, conflict_sentences, contradicted, lowered
+from hil.estimator.selection.verdict import MUCH_LEFT
 from hil.results.parts import Verdict
 
-__all__ = ["FITTED_SHARE", "chain_verdict"]
+__all__ = ["FITTED_SHARES", "chain_verdict"]
 
-FITTED_SHARE = 0.75  # fraction of each recording that is fitted; the rest serves as a check
+FITTED_SHARES = (0.75, 0.6, 0.5)
+"""Fraction of each recording that is fitted; the rest serves as a check. The first one for which every joint moves in
+both parts is used.
+"""
 EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
 TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative torque error on the last part: limits for yes and no
 TORQUE_UNEXPLAINED = 0.1  # limit for rejecting a model that leaves part of the motion unexplained
@@ -40,13 +44,15 @@ def chain_verdict(
     sticking: Sequence[int] = (),
     gravity: Array | None = None,
     changed: ChangedColumns | None = None,
+    fitted_share: float = FITTED_SHARES[0],
 ) -> Verdict:
     """The verdict, with reasons.
 
     foretold: relative torque error on the last part of the recordings (joints,); None without one. contradictory, late:
     sentences about torques that contradict each other in the regression, or are logged late. sticking: joints that
     stick, numbered from 0. gravity: see `better_gravity_recorded`. changed: the mistake in the columns, if it is known;
-    advice that assumes sound columns is then withheld.
+    advice that assumes sound columns is then withheld. fitted_share: fraction of the recordings to which the model was
+    fitted for `foretold`.
     """
     names = found.model.base.names
     weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
@@ -59,7 +65,9 @@ def chain_verdict(
     cause = _cause(gravity, changed)
     judgements = (
         *(_of_residual(found, arm, cause) if found.simulated else (_AS_MEASURED,)),
-        _of_prediction(foretold, arm, explained, bool(cause)),
+        _of_prediction(foretold, fitted_share, arm, explained, bool(cause))
+        if foretold is not None
+        else _without_prediction(found),
         *_of_values(found, prior, bool(cause)),
         (contradicted(found.conflicts, explained), () if cause else conflict_sentences(found.conflicts, explained)),
         *_of_torques(found, arm, contradictory, late),
@@ -164,20 +172,26 @@ def _missing(model: ChainModel, cause: str) -> str:
     )
 
 
+def _without_prediction(found: RecordedChain) -> Judgement:
+    said = (
+        "The recordings are too short, or their joints move in too small a part of them, to check the prediction on a "
+        "part that was not fitted."
+    )
+    left = float(found.residual_over_noise.max()) if found.simulated else 0.0
+    if left <= MUCH_LEFT:
+        return "with care", (said,)
+    return "no", (said, f'Without that check, a residual above {MUCH_LEFT:g} times the noise makes the verdict "no".')
+
+
 def _of_prediction(
-    foretold: Array | None, arm: ArmDescription, explained: bool, is_cause_known: bool = False
+    foretold: Array, fitted_share: float, arm: ArmDescription, explained: bool, is_cause_known: bool
 ) -> Judgement:
     """The best verdict that the prediction of the last part allows ("" for any), and why.
 
     is_cause_known: whether the verdict names the cause.
     """
-    if foretold is None:
-        return "with care", (
-            "The recordings are too short, or continue for too long after the motion has ended, to check the "
-            "prediction on a part that was not fitted.",
-        )
     error, wrong = float(np.nanmax(foretold)), TORQUE_WRONG if explained else TORQUE_UNEXPLAINED
-    said = _foretold_said(error, arm.joints[int(np.nanargmax(foretold))].name)
+    said = _foretold_said(error, fitted_share, arm.joints[int(np.nanargmax(foretold))].name)
     if error <= wrong:
         return "with care" if error > TORQUE_FORETOLD else "", (said,)
     unexplained = "" if explained else " together with an unexplained part of the motion"
@@ -189,9 +203,9 @@ def _of_prediction(
     return "no", (said, f'An error above {100 * wrong:.0f} %{unexplained} makes the verdict "no"{check}.')
 
 
-def _foretold_said(error: float, joint: str) -> str:
+def _foretold_said(error: float, fitted_share: float, joint: str) -> str:
     """Describe how well the last part is predicted. error: relative to the RMS torque. joint: the joint with it."""
-    part = f"the torque in the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
+    part = f"the torque in the last {100 * (1 - fitted_share):.0f} % of each recording"
     if error > 1.0:
         return (
             f"When fitted to the rest, the model cannot predict {part}: the error is {error:.2g} times the "

@@ -114,7 +114,7 @@ def attempts_of(results: list[int]) -> tuple[list[float], str]:
     clock, times = VirtualClock(), []
     servo = Servo.__new__(Servo)
     servo.id, servo.title = 1, "The servo"
-    servo.port = SimpleNamespace(clock=clock, growth=1)  # type: ignore[assignment]
+    servo.port = SimpleNamespace(clock=clock, growth=1, late_replies=0)  # type: ignore[assignment]
     servo._sdk_port = SimpleNamespace()  # type: ignore[assignment]
     servo._sdk = SimpleNamespace(getTxRxResult=lambda _: "[TxRxResult] Incorrect status packet!")
 

@@ -5,7 +5,7 @@ import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from hil.estimation.unsettled import chain_recordings
 from hil.estimation.unsettled.chain_recordings import _drive
 from hil.estimation.unsettled.chain_verdict import chain_verdict
 from hil.estimator.chain.model.chain_model import ChainModel
-from hil.estimator.errors import ConvergenceError
+from hil.estimator.errors import ConvergenceError, StandstillError
 from tests.support.command_line import hil
 
 SAMPLES = 2000  # of a period of 4000
@@ -224,3 +224,27 @@ def test_what_is_missing_is_named(setup: bench.Setup, urdf: str, names: int, sai
     with pytest.raises(ConfigError, match=said):
         api.estimate("arm.csv", config=described(setup, "held", urdf, names), out="refused")
     assert not Path("refused").exists()
+
+
+def test_the_check_is_made_on_a_part_in_which_every_joint_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A joint that rests in the last quarter must not prevent the check."""
+    asked: list[float] = []
+
+    def part(recording: Any, start: float, end: float) -> Any:
+        if start:
+            asked.append(start)
+            if start > 0.7:
+                raise StandstillError("joint 3 rests")
+        return recording
+
+    monkeypatch.setattr(chain_recordings, "_part", part)
+    monkeypatch.setattr(chain_recordings, "identify_recordings", lambda *_: None)
+    monkeypatch.setattr(chain_recordings, "torque_error", lambda *_: np.full(4, 0.02))
+    error, share = chain_recordings._held_out([cast(Any, None)], cast(Any, None), cast(Any, None))
+    assert error is not None and share == 0.6 and asked == [0.75, 0.6]
+
+
+def test_without_a_check_a_large_residual_makes_the_verdict_no(setup: bench.Setup) -> None:
+    for residual, trust in ((1.0, "with care"), (4.9, "with care"), (5.1, "no")):
+        arm, found = fitted(setup, np.full(4, residual), 0.9)
+        assert chain_verdict(found, arm, None, setup.prior).trust == trust

@@ -63,7 +63,7 @@ STAGES: dict[str, Stage] = {
     "first stage of the estimation": Stage("identify", "hil.estimation.settled_estimate:settled_period"),
     "choice": Stage("identify", "hil.estimation.settled_estimate:_estimate"),
     "held-out check": Stage("identify", "hil.estimation.settled_estimate:validate"),
-    "report": Stage("identify", "hil.report.page:write_page"),
+    "report": Stage("identify", "hil.report.page:write_whole"),
     "export": Stage("export", "hil.export.mjcf:write_text"),
 }
 
