@@ -84,6 +84,8 @@ def borrowed_length(config: Config, estimate: Estimate) -> tuple[str, ...]:
     if estimate.model.lever is None or config.arm.link_lengths is None or seen is None:
         return ()
     length, (found, std) = config.arm.link_lengths[0], seen
+    if not np.isfinite(std):
+        return ()
     share = std / abs(found) / LEVER_STD
     if share < MOSTLY_BORROWED:
         return ()
