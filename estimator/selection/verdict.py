@@ -211,7 +211,7 @@ def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
         return f'{cause}No single term explains the residual; [model] friction = "auto" tries several together.'
     return (
         f"No available term explains the residual. {cause}{'Other possible' if cause else 'Possible'} causes: cogging "
-        "or torque ripple, backlash, a loose screw, a sagging supply or a dragging cable."
+        "or torque ripple, backlash, an elastic belt or link, a loose screw, a sagging supply or a dragging cable."
     )
 
 
