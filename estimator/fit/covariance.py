@@ -198,16 +198,19 @@ def larger_covariance(robust: Array, white: Array) -> Array:
     return covariance
 
 
-def by_parameters(covariance: Array, slopes: Array, value: Array) -> Array:
+def by_parameters(covariance: Array, slopes: Array, value: Array, floored: Mask | None = None) -> Array:
     """Return the covariance of the parameters (parameters, parameters) from that of their coordinates.
 
-    A positive parameter that has run into its floor is practically zero, and its own value serves as its standard
-    error. Such a parameter is recognised by its slope, which equals the distance from the floor, since the coordinate
-    is the logarithm of this distance.
+    A parameter that has run into its floor is practically zero, and its own value serves as its standard error. It is
+    recognised by its slope, which equals the distance from the floor, since the coordinate is the logarithm of this
+    distance.
+
+    floored: which parameters (parameters,) have a floor; by default none.
     """
     hidden = np.isinf(np.diag(covariance))
     finite: Array = slopes @ np.where(np.isfinite(covariance), covariance, 0.0) @ slopes.T
-    faint = hidden & (np.diag(slopes) < VANISHED * np.abs(value))
     finite[hidden, hidden] = np.inf
-    finite[faint, faint] = value[faint] ** 2
+    if floored is not None:
+        faint = hidden & floored & (np.diag(slopes) < VANISHED * np.abs(value))
+        finite[faint, faint] = value[faint] ** 2
     return finite

@@ -392,7 +392,9 @@ def _estimate(
     value = angle_scale * found.shared
     value[:count] = coordinates.values(found.shared[:count])
     recording = np.array([segment.recording for segment in problem.segments])
-    covariance = by_parameters(found.covariance(recording, problem.zeros), slope, value)
+    floored = np.zeros(value.size, dtype=np.bool_)
+    floored[:count] = coordinates.floored
+    covariance = by_parameters(found.covariance(recording, problem.zeros), slope, value, floored)
     samples = np.stack([_samples(segment) for segment in problem.segments])
     squares = problem.errors(coordinates, found) ** 2 * samples
     return ShootingEstimate(

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hil.estimator.arrays import Array
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.models.model import LEVER_STD, Model
 from hil.estimator.models.terms import BEYOND_SPEEDS, Scale, Term, joint_of, kind_of, term_of
 from hil.estimator.options import CoordinateOptions
@@ -162,6 +162,11 @@ class Coordinates:
             upper[share] = np.sqrt(value[first] * value[second])
             lower[share] = -upper[share]
         return lower, upper
+
+    @property
+    def floored(self) -> Mask:
+        """Which parameters (parameters,) are widths, with a floor above zero."""
+        return np.asarray(self._floors > 0.0)
 
     @cached_property
     def _either_sign(self) -> Array:

@@ -287,8 +287,9 @@ def _fit(
     covariance = robust_covariance(
         minimum.at, errors.scatter, errors.samples, count, errors.structured, errors.expected
     )
-    value = objective.coordinates.values(x[:count])
-    widened = by_parameters(covariance, objective.coordinates.slopes(x[:count]), value)
+    coordinates = objective.coordinates
+    value = coordinates.values(x[:count])
+    widened = by_parameters(covariance, coordinates.slopes(x[:count]), value, coordinates.floored)
     return Fit(
         value,
         widened,
@@ -297,7 +298,7 @@ def _fit(
         refined.outliers,
         float(errors.lags),
         minimum.iterations,
-        _at_bound(objective.coordinates, minimum, value, np.sqrt(np.diag(widened))),
+        _at_bound(coordinates, minimum, value, np.sqrt(np.diag(widened))),
     )
 
 

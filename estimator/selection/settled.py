@@ -192,6 +192,7 @@ class Selection:
         bristles may have absorbed part of the ripple.
         """
         fitted = sorted((each for each in self.trials if each.estimate is not None), key=self._left)
+        fitted = [each for each in fitted if each.has_standard_errors] or fitted
         kinds = {"presliding" in each.model.options: each for each in reversed(fitted)}
         return sorted(kinds.values(), key=self._left)
 
@@ -302,8 +303,14 @@ class Selection:
         return best
 
     def _better(self, richer: Trial | None, plainer: Trial | None) -> Trial | None:
+        """Return the trial to continue from. One without standard errors is too sensitive for any score test, so it is
+        returned only if it explains nearly everything and the other one does not.
+        """
         if richer is None or plainer is None:
             return richer or plainer
+        if richer.has_standard_errors != plainer.has_standard_errors:
+            sure, unsure = (richer, plainer) if richer.has_standard_errors else (plainer, richer)
+            return unsure if self._is_nearly_explained(unsure) and not self._is_nearly_explained(sure) else sure
         if richer.model == plainer.model:
             return min(richer, plainer, key=self._left)
         return richer if self._gain(richer, plainer) > self._worth(richer, plainer) else plainer

@@ -46,8 +46,10 @@ class Trial:
 
     @property
     def has_standard_errors(self) -> bool:
-        """Whether the fit succeeded and any parameter has a finite standard error."""
-        return self.estimate is not None and bool(np.isfinite(self.estimate.std).any())
+        """Whether the fit succeeded and any base parameter has a finite standard error."""
+        if self.estimate is None:
+            return False
+        return bool(np.isfinite(self.estimate.std[: len(self.model.base_names)]).any())
 
 
 @dataclass(frozen=True)

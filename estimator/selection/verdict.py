@@ -55,6 +55,10 @@ ODD_HINT = "Its residual at odd harmonics indicates friction or ripple that the 
 EVEN_HINT = (
     "Its residual at even harmonics indicates an effect that depends on direction, or an offset in torque or angle."
 )
+NO_ERRORS = (
+    "No parameter has a standard error, because the simulated motion is extremely sensitive to some term of the model. "
+    'Estimate again with a simpler model, such as [model] friction = "stribeck" with presliding = false.'
+)
 BEYOND_NOISE = 2.0
 
 
@@ -138,7 +142,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
 def _trust(validation: Validation, evidence: Evidence, at_bound: Sequence[str]) -> Trust:
     left = float(validation.residual_over_floor.max())
     against = contradicted(evidence.conflicts, left <= EXPLAINED)
-    if against == "no" or not np.isfinite(list(validation.relative_std.values())).any():
+    if against == "no" or not _has_errors(validation):
         return "no"
     doubtful = any(_is_weak(validation, name) for name in validation.relative_std)
     doubtful = doubtful or bool(evidence.doubts or evidence.disturbances or evidence.torque or against or at_bound)
@@ -152,13 +156,19 @@ def _trust(validation: Validation, evidence: Evidence, at_bound: Sequence[str]) 
     return "with care" if doubtful or left > MUCH_LEFT or worst > GOOD_PREDICTION else "yes"
 
 
+def _has_errors(validation: Validation) -> bool:
+    """Return whether any parameter has a finite standard error."""
+    return bool(np.isfinite(list(validation.relative_std.values())).any())
+
+
 def _is_weak(validation: Validation, name: str) -> bool:
     """Return whether a parameter is poorly known although the arm's torque depends on it."""
     return validation.relative_std[name] > WEAK and not validation.torque_std[name] <= LITTLE_EFFECT
 
 
 def _noise(validation: Validation) -> str:
-    noise = validation.levels.noise
+    # The noise includes the residual's; at a low rate, its estimate may also include fast parts of the motion.
+    noise = validation.levels.noise * np.minimum(validation.residual_over_floor, 1.0)
     joint = int(np.argmax(noise))
     if noise[joint] * np.sqrt(12.0) < NOISY:
         return "The model explains the motion down to the encoders' rounding."
@@ -201,7 +211,7 @@ def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
         return f'{cause}No single term explains the residual; [model] friction = "auto" tries several together.'
     return (
         f"No available term explains the residual. {cause}{'Other possible' if cause else 'Possible'} causes: cogging "
-        "or torque ripple, backlash, a loose screw, a sagging supply or a dragging cable."
+        "or torque ripple, backlash, an elastic belt or link, a loose screw, a sagging supply or a dragging cable."
     )
 
 
@@ -212,6 +222,8 @@ def _in_words(part: str) -> str:
 
 def _spoilt(validation: Validation, trust: Trust) -> str:
     """Return a sentence about parameters that the model error may bias, selected by their inflated standard errors."""
+    if not _has_errors(validation):
+        return "This error may bias all parameters."
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst and trust == "no":
         return "This error may bias all parameters, regardless of their standard errors."
@@ -363,6 +375,8 @@ def _late_back_emf(estimate: Estimate, name: str) -> bool:
 
 
 def _weak(estimate: Estimate, validation: Validation, limit: TorqueLimit | None) -> tuple[str, ...]:
+    if not _has_errors(validation):
+        return (NO_ERRORS,)
     name = validation.weakest
     part = validation.relative_std[name]
     if part <= WELL_KNOWN:

@@ -72,8 +72,11 @@ def _seen_length(gravity: float, estimate: Estimate | ShootingEstimate) -> tuple
         return None
     found = coupling * gravity / weight
     at = [estimate.names.index(name) for name in ("coupling", "gravity_2")]
+    covariance = estimate.covariance[np.ix_(at, at)]
+    if not np.isfinite(covariance).all():
+        return None
     slope = np.array([found / coupling, -found / weight])
-    return found, float(np.sqrt(max(0.0, slope @ estimate.covariance[np.ix_(at, at)] @ slope)))
+    return found, float(np.sqrt(max(0.0, slope @ covariance @ slope)))
 
 
 def borrowed_length(config: Config, estimate: Estimate) -> tuple[str, ...]:

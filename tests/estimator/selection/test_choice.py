@@ -202,7 +202,42 @@ def test_an_estimate_without_standard_errors_is_not_chosen_however_well_it_predi
     search.trials = search.trials[1:]
     assert search.judged(search.trials[0]).estimate is stiff, "better than no estimate"
     verdict = judge(stiff, validate(ideal_period, stiff), Evidence(np.zeros(2)))
-    assert verdict.trust == "no" and "hard to separate" not in " ".join(verdict.sentences)
+    said = " ".join(verdict.sentences)
+    assert verdict.trust == "no" and "hard to separate" not in said
+    assert "No parameter has a standard error" in said and "no information" not in said and "determined" not in said
+
+
+def test_the_noise_is_not_larger_than_what_the_model_leaves(ideal_period: SettledPeriod) -> None:
+    """At a low rate, fast parts of the motion pass for noise."""
+    estimate = identify(ideal_period, Model(2))
+    validation = validate(ideal_period, estimate)
+    levels = replace(validation.levels, noise=1.5 * validation.levels.noise)
+    overrated = replace(validation, levels=levels, residual_over_floor=validation.residual_over_floor / 1.5)
+    said = judge(estimate, overrated, Evidence(np.zeros(2))).sentences[0]
+    assert said == "The model explains the motion down to the encoders' rounding."
+
+
+def test_an_estimate_with_errors_of_other_terms_only_is_not_chosen_either(ideal_period: SettledPeriod) -> None:
+    plain = identify(ideal_period, Model(2, "coulomb", "lag"), coarse=True)
+    covariance = np.diag(np.where([name == "lag" for name in plain.names], 1.0, np.inf))
+    stiff = replace(plain, covariance=covariance)
+    search = Selection([ideal_period], ideal_period, (), SelectionOptions(), None)
+    search.trials = [Trial(each.model, each, None, score, 0.0) for each, score in ((plain, 8.0), (stiff, 3.0))]
+    assert search.judged(search.trials[1]).estimate is plain
+
+
+@pytest.mark.parametrize(("left", "is_kept"), [(5.0, False), (1.0, True)])
+def test_a_fit_without_standard_errors_is_continued_only_if_it_alone_explains_the_motion(
+    ideal_period: SettledPeriod, left: float, is_kept: bool
+) -> None:
+    fitted = identify(ideal_period, Model(2, "coulomb", "lag"), coarse=True)
+    plain = replace(fitted, residual=10.0 * fitted.residual)
+    covariance = np.full_like(plain.covariance, np.inf)
+    stiff = replace(fitted, residual=left * fitted.residual, covariance=covariance)
+    search = Selection([ideal_period], ideal_period, (), SelectionOptions(), None)
+    sure, unsure = (Trial(each.model, each, None, 1.0, 0.0) for each in (plain, stiff))
+    for found in (search._better(unsure, sure), search._better(sure, unsure)):
+        assert found is (unsure if is_kept else sure)
 
 
 def test_a_parameter_that_the_motion_does_not_determine_is_not_known_to_within_a_million_percent(

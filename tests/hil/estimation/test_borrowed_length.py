@@ -1,9 +1,11 @@
 """The length of link 1 as prior knowledge: it helps if it is right, and does little harm if it is wrong."""
 
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hil.estimation.plausibility import borrowed_length
@@ -53,3 +55,8 @@ def test_the_verdict_says_what_the_coupling_rests_on() -> None:
     faint = said(estimate(LENGTH, (0.16, 0.08)), LENGTH)
     assert "rests on arm.link_lengths[0] = 0.147 m, assumed to be right to within 5 %" in faint
     assert "may contradict arm.link_lengths[0] = 0.2205 m" in said(estimate(1.5 * LENGTH, (0.17, 0.085)), 1.5 * LENGTH)
+
+
+def test_nothing_is_said_of_a_length_without_standard_error() -> None:
+    found = estimate(LENGTH, (0.16, 0.08))
+    assert said(replace(found, covariance=np.diag(np.full(len(found.names), np.inf))), LENGTH) == ""
