@@ -44,11 +44,13 @@ LOAD, ASYMMETRY, SINE, COSINE, CYCLES, ZERO, SCALE = map(
 )
 SATURATION, CABLE, GENERATED = map(place_of, ("saturation", "cable_stiffness", "back_emf"))
 COG_SINE, COG_COSINE, COG_CYCLES = map(place_of, ("cogging_sin", "cogging_cos", "cogging_cycles"))
+STIFFNESS = place_of("presliding_stiffness")
 
 INTEGRATION = IntegrationOptions()
 MAX_SUBSTEPS = INTEGRATION.max_substeps
 FADED = 40.0  # exp(-40) is negligible compared with 1, and the library takes longer for such arguments
 GAMMA = 1.0 - math.sqrt(0.5)
+STEADY_WIDTHS = 0.25  # largest change in velocity in a substep near standstill, in widths of the Coulomb step
 
 
 def steps_per_sample(rate: float, longest: float = INTEGRATION.max_step) -> int:
@@ -107,7 +109,7 @@ def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> NDA
     numbers are powers of two, so that small changes in the physics seldom change them. A changed number would alter the
     last digits of the motion.
     """
-    needed = [min(4.0 * step / max(time, 1e-12), most) for time in physics.crossing_times()]
+    needed = [min(step / (STEADY_WIDTHS * max(time, 1e-12)), most) for time in physics.crossing_times()]
     return np.array([2 ** math.ceil(math.log2(max(each, 1.0))) for each in needed], dtype=np.int64)
 
 
@@ -187,11 +189,29 @@ def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float,
     near_2 = (p[COULOMB + 1] > 0.0) & ((min(abs(v2), abs(u2)) < 6.0 * p[WIDTH + 1]) | (v2 * u2 < 0.0))
     finest = max(pieces[0], pieces[1])
     at_once = left
+    # The last acceleration does not include the effect of a new torque, so each step starts with a short substep.
     if near_1:
-        at_once = min(at_once, finest // pieces[0])
+        steady = pieces_while_steady(p, 0, a1, piece, left) if left < finest else 1
+        at_once = min(at_once, max(steady, finest // pieces[0]))
     if near_2:
-        at_once = min(at_once, finest // pieces[1])
+        steady = pieces_while_steady(p, 1, a2, piece, left) if left < finest else 1
+        at_once = min(at_once, max(steady, finest // pieces[1]))
     return at_once
+
+
+def pieces_while_steady(p: Any, joint: int, a: float, piece: float, left: int) -> int:
+    """Return how many of the `left` remaining substeps change a joint's velocity by no more than a substep of
+    `finer_pieces` may.
+
+    A joint held by dry friction needs no short substeps, since the method is L-stable for the slope of friction. Bristles
+    always need them, since they oscillate. a: last acceleration [rad/s^2].
+    """
+    if p[STIFFNESS + joint] > 0.0:
+        return 1
+    most = STEADY_WIDTHS * p[WIDTH + joint]
+    while left > 1 and abs(a) * left * piece > most:
+        left //= 2
+    return left
 
 
 def step_on(
@@ -275,7 +295,7 @@ def _loop(
 
 # Functions called only from compiled code need no wrappers, which take a second to compile. They are inlined because
 # the reference counting for their arrays would take longer than the arithmetic of a step.
-bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent = map(
-    inlined, (bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent)
+bump_at, bend_at, _drive, _forces, pieces_while_steady, pieces_now, step_on, step_bent = map(
+    inlined, (bump_at, bend_at, _drive, _forces, pieces_while_steady, pieces_now, step_on, step_bent)
 )
 _simulate: Callable[..., None] = compiled(_loop)
