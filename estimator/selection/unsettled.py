@@ -33,6 +33,8 @@ SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable")
 FINE = ShootingOptions()
 QUICK = ShootingOptions(ftol=1e-3, max_step=FINE.coarse_step, reweightings=1)
 """Options for fits that are only compared with each other."""
+QUICK_PRESLIDING = replace(QUICK, max_substeps=16)
+"""The same for models with presliding; few substeps, since extremely stiff bristles would always need the maximum."""
 EXPLAINED = 1.1  # ratio of residual to noise for an explained motion; the noise is estimated from the same samples
 NEARLY = 1.5  # ratio of residual to noise up to which the likelihood can be trusted to choose
 
@@ -163,7 +165,7 @@ class _Search:
         """
         if model not in self._trials:
             began = time.perf_counter()
-            half = self.fit(model, near, FITTED, QUICK)
+            half = self.fit(model, near, FITTED, QUICK_PRESLIDING if "presliding" in model.options else QUICK)
             error, score = (None, np.inf) if half is None else held_out_errors(self._recordings, half, PREDICTED)
             self._trials[model] = SegmentTrial(model, error, score, time.perf_counter() - began)
         return self._trials[model]

@@ -203,8 +203,8 @@ def pieces_while_steady(p: Any, joint: int, a: float, piece: float, left: int) -
     """Return how many of the `left` remaining substeps change a joint's velocity by no more than a substep of
     `finer_pieces` may.
 
-    A joint held by dry friction needs no short substeps, since the method is L-stable for the slope of friction. Bristles
-    always need them, since they oscillate. a: last acceleration [rad/s^2].
+    A joint held by dry friction needs no short substeps, since the method is L-stable for the slope of friction.
+    Bristles always need them, since they oscillate. a: last acceleration [rad/s^2].
     """
     if p[STIFFNESS + joint] > 0.0:
         return 1
