@@ -6,9 +6,10 @@ simulation with all derivatives gives the decrease in the sum of squares for eac
 (1989) 223).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -90,15 +91,15 @@ def _searched(altered: Altered, every: Sequence[Hypothesis]) -> Defect | None:
     if not likely:
         return None
     given = altered.fit(None)
-    found = _best(altered, likely, given, linear.independent)
+    found = _best(altered.fit, likely, given, linear.independent)
     if found is None or found.hypothesis.course.kind != "step" or found.explained < PROMISING:
         return found
     if found.fit.left > EXPLAINED:
         near = [found.hypothesis, *_neighbours(found.hypothesis, every)]
-        found = _best(altered, near, given, linear.independent) or found
+        found = _best(partial(altered.fit_from, near=found.fit), near, given, linear.independent) or found
     # Hypotheses that place the change in different segments were compared on different data.
     then = [each for other in likely for each in every if _is_same(other, each, found.hypothesis.course)]
-    return _best(altered, then, given, linear.independent, found.fit) or found
+    return _best(partial(altered.fit, near=found.fit), then, given, linear.independent) or found
 
 
 def _is_same(hypothesis: Hypothesis, other: Hypothesis, course: Course) -> bool:
@@ -129,17 +130,13 @@ def _neighbours(hypothesis: Hypothesis, every: Sequence[Hypothesis]) -> list[Hyp
 
 
 def _best(
-    altered: Altered,
-    likely: Sequence[Hypothesis],
-    given: AlteredFit,
-    independent: float,
-    near: AlteredFit | None = None,
+    fit_of: Callable[[Hypothesis], AlteredFit], likely: Sequence[Hypothesis], given: AlteredFit, independent: float
 ) -> Defect | None:
     """Fit the `likely` hypotheses and return the most probable one. independent: number of independent samples."""
     found: list[Defect] = []
     for hypothesis in likely:
         with suppress(ConvergenceError):
-            fit = altered.fit(hypothesis, near)
+            fit = fit_of(hypothesis)
             if float(np.abs(fit.unknowns[-hypothesis.unknowns :]).max()) >= LEAST[hypothesis.kind]:
                 found.append(Defect(hypothesis, fit, given))
 
