@@ -36,6 +36,7 @@ QUICK = ShootingOptions(ftol=1e-3, max_step=FINE.coarse_step, reweightings=1)
 QUICK_PRESLIDING = replace(QUICK, max_substeps=16)
 """The same for models with presliding; few substeps, since extremely stiff bristles would always need the maximum."""
 EXPLAINED = 1.1  # ratio of residual to noise for an explained motion; the noise is estimated from the same samples
+HOPELESS = 0.3  # prediction error relative to the motion above which a fit, which is not to be used, is not refined
 NEARLY = 1.5  # ratio of residual to noise up to which the likelihood can be trusted to choose
 
 
@@ -165,7 +166,7 @@ class _Search:
         """
         if model not in self._trials:
             began = time.perf_counter()
-            half = self.fit(model, near, FITTED, QUICK_PRESLIDING if "presliding" in model.options else QUICK)
+            half = self.fit(model, near, FITTED, _quick(model))
             error, score = (None, np.inf) if half is None else held_out_errors(self._recordings, half, PREDICTED)
             self._trials[model] = SegmentTrial(model, error, score, time.perf_counter() - began)
         return self._trials[model]
@@ -190,7 +191,8 @@ class _Search:
             found = self.trial(near, model)
             if found.score < self._options.keep_ratio * best.score:
                 best = found
-        return self.fit(best.model, near) or plain
+        options = FINE if best.score < HOPELESS else _quick(best.model)
+        return self.fit(best.model, near, options=options) or plain
 
     def judged(self, plain: ShootingEstimate, best: ShootingEstimate) -> SegmentChoice:
         """Return the choice: `best`, or the simplest model if it predicts held-out segments much better. If no model
@@ -242,6 +244,10 @@ class _Search:
     @property
     def _samples(self) -> float:
         return float(sum(np.isfinite(each.position).sum() for each in self._recordings))
+
+
+def _quick(model: Model) -> ShootingOptions:
+    return QUICK_PRESLIDING if "presliding" in model.options else QUICK
 
 
 def _left(estimate: ShootingEstimate) -> float:
