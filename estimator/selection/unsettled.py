@@ -36,7 +36,7 @@ QUICK = ShootingOptions(ftol=1e-3, max_step=FINE.coarse_step, reweightings=1)
 QUICK_PRESLIDING = replace(QUICK, max_substeps=16)
 """The same for models with presliding; few substeps, since extremely stiff bristles would always need the maximum."""
 EXPLAINED = 1.1  # ratio of residual to noise for an explained motion; the noise is estimated from the same samples
-HOPELESS = 0.3  # prediction error relative to the motion above which a fit, which is not to be used, is not refined
+HOPELESS = 0.3  # prediction error relative to the motion, above which a fit is useless and is not refined
 NEARLY = 1.5  # ratio of residual to noise up to which the likelihood can be trusted to choose
 
 
@@ -191,8 +191,7 @@ class _Search:
             found = self.trial(near, model)
             if found.score < self._options.keep_ratio * best.score:
                 best = found
-        options = FINE if best.score < HOPELESS else _quick(best.model)
-        return self.fit(best.model, near, options=options) or plain
+        return self.fit(best.model, near, options=_final(best)) or plain
 
     def judged(self, plain: ShootingEstimate, best: ShootingEstimate) -> SegmentChoice:
         """Return the choice: `best`, or the simplest model if it predicts held-out segments much better. If no model
@@ -203,7 +202,7 @@ class _Search:
         plainest, chosen = self.trial(plain, simple), self.trial(best, best.model)
         ratio = self._options.overrule_ratio if _left(best) < EXPLAINED else 1.0
         if plainest.score < ratio * chosen.score:
-            best, chosen = self.fit(simple, plain) or best, plainest
+            best, chosen = self.fit(simple, plain, options=_final(plainest)) or best, plainest
         if not np.isfinite(chosen.score):
             raise ConvergenceError("no friction model could be fitted to half of the segments: record for longer")
         return SegmentChoice(tuple(self._trials.values()), chosen, best, plain)
@@ -248,6 +247,12 @@ class _Search:
 
 def _quick(model: Model) -> ShootingOptions:
     return QUICK_PRESLIDING if "presliding" in model.options else QUICK
+
+
+def _final(chosen: SegmentTrial) -> ShootingOptions:
+    """Return the options for the final fit of the chosen model."""
+    is_hopeless = chosen.held_out is None or float(chosen.held_out.max()) > HOPELESS
+    return _quick(chosen.model) if is_hopeless else FINE
 
 
 def _left(estimate: ShootingEstimate) -> float:
