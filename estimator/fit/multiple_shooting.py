@@ -132,7 +132,7 @@ class Shooting:
         torque = self._torque(segment, physics)[0]
         step = self._grids[segment.recording].step
         most = self._options.max_substeps
-        grid, end = simulate(physics, state, np.ascontiguousarray(torque[:, :, None]), step, most)
+        grid, end = simulate(physics, state, np.ascontiguousarray(torque[:, :, None]), step, most, held=True)
         return segment.at_samples(np.concatenate((grid, end[:1].T), axis=1))
 
     def position_by_values(
@@ -183,6 +183,7 @@ class Shooting:
             (*names, *zeros, *state),
             self._grids[segment.recording].step,
             self._options.max_substeps,
+            held=True,
         )
         # One step is appended so that the state after the last step is returned; its torque is irrelevant.
         torque, slopes = (

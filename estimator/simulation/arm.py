@@ -65,6 +65,7 @@ def simulate(
     step: float,
     max_substeps: int = MAX_SUBSTEPS,
     springs: tuple[Array, Array] | None = None,
+    held: bool = False,
 ) -> tuple[Array, Array]:
     """Simulate as many samples as `torque` has.
 
@@ -77,6 +78,7 @@ def simulate(
         max_substeps: maximum number of substeps into which a step is divided near standstill.
         springs: stiffness of additional springs (joints,) [N m/rad] and the angles to which they pull the joints, held
             between samples (joints, samples) [rad].
+        held: whether joints that are held by friction take longer substeps.
 
     Returns:
         The angles at the samples (joints, samples) [rad] and the state after the last sample's steps (3, joints).
@@ -98,7 +100,7 @@ def simulate(
         vector[CABLE : CABLE + joints] += stiffness
         pulls[:joints] = stiffness[:, None] * ends
     moving = without_dry_friction(vector)
-    _simulate(vector, has_bristles(physics), moving, state, both, pulls, step, pieces, position)
+    _simulate(vector, has_bristles(physics), moving, state, both, pulls, step, pieces, held, position)
     return position[:joints], state[:, :joints]
 
 
@@ -177,11 +179,14 @@ def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: f
     )
 
 
-def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float, pieces: Any, left: int) -> int:
+def pieces_now(
+    p: Any, v1: float, v2: float, a1: float, a2: float, piece: float, pieces: Any, left: int, held: bool
+) -> int:
     """Return how many of the `left` remaining substeps of length `piece` [s] may be taken at once.
 
     v1, v2: velocities [rad/s]. a1, a2: last accelerations [rad/s^2]. pieces: number of substeps in a step while each
-    joint is near standstill (joints,); a substep is a step divided by the larger of them.
+    joint is near standstill (joints,); a substep is a step divided by the larger of them. held: whether a joint that is
+    held by friction may take longer ones.
     """
     ahead = 2.0 * left * piece
     u1, u2 = v1 + ahead * a1, v2 + ahead * a2
@@ -191,10 +196,10 @@ def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float,
     at_once = left
     # The last acceleration does not include the effect of a new torque, so each step starts with a short substep.
     if near_1:
-        steady = pieces_while_steady(p, 0, a1, piece, left) if left < finest else 1
+        steady = pieces_while_steady(p, 0, a1, piece, left) if held and left < finest else 1
         at_once = min(at_once, max(steady, finest // pieces[0]))
     if near_2:
-        steady = pieces_while_steady(p, 1, a2, piece, left) if left < finest else 1
+        steady = pieces_while_steady(p, 1, a2, piece, left) if held and left < finest else 1
         at_once = min(at_once, max(steady, finest // pieces[1]))
     return at_once
 
@@ -269,7 +274,16 @@ def step_bent(
 
 # pulls: torques of the springs if the joints were at zero (2, samples) [N m], or (2, 0) without springs.
 def _loop(
-    p: Any, bristly: bool, m: Any, state: Any, torque: Any, pulls: Any, step: float, pieces: Any, position: Any
+    p: Any,
+    bristly: bool,
+    m: Any,
+    state: Any,
+    torque: Any,
+    pulls: Any,
+    step: float,
+    pieces: Any,
+    held: bool,
+    position: Any,
 ) -> None:
     q1, q2, v1, v2 = state[0, 0], state[0, 1], state[1, 0], state[1, 1]
     b = state[2]
@@ -287,7 +301,7 @@ def _loop(
             t1, t2 = torque[0, k, s], torque[1, k, s]
             left = finest
             while left > 0:
-                n = pieces_now(p, v1, v2, a1, a2, piece, pieces, left)
+                n = pieces_now(p, v1, v2, a1, a2, piece, pieces, left, held)
                 q1, q2, v1, v2, a1, a2 = step_bent(p, bristly, m, b, q1, q2, v1, v2, a1, a2, t1, t2, n * piece)
                 left -= n
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2

@@ -60,7 +60,8 @@ def test_a_joint_that_is_held_by_friction_takes_long_substeps(
     vector[arm.STIFFNESS] = stiffness
     slow = 0.1 * STICKING
     pieces = np.array([64, 1])
-    assert now(vector, slow, 0.0, acceleration, 0.0, STEP / 64, pieces, left) == taken
+    assert now(vector, slow, 0.0, acceleration, 0.0, STEP / 64, pieces, left, True) == taken
+    assert now(vector, slow, 0.0, acceleration, 0.0, STEP / 64, pieces, left, False) == 1
 
 
 def test_breaking_away_from_standstill_is_that_of_much_shorter_steps() -> None:
@@ -70,7 +71,7 @@ def test_breaking_away_from_standstill_is_that_of_much_shorter_steps() -> None:
     start, finer = np.zeros((2, 2)), 64
 
     def moved(steps: int) -> Array:
-        return arm.simulate(physics, start, np.repeat(torque, steps, axis=2), 1 / (RATE * steps))[0]
+        return arm.simulate(physics, start, np.repeat(torque, steps, axis=2), 1 / (RATE * steps), held=True)[0]
 
     found, finest = moved(2), moved(2 * finer)
     still = np.abs(np.diff(finest, axis=1)) < 1e-5
