@@ -202,6 +202,8 @@ class ShootingOptions:
     """Longest integration step of the earlier fits [s]. They run three times as fast as with `max_step`; their errors
     amount to hundredths of a standard error.
     """
+    max_substeps: int = IntegrationOptions.max_substeps
+    """Maximum number of substeps into which a step is divided near standstill."""
     start_segments: int = 80
     """Maximum number of segments, evenly distributed, in the fits that only need to come close to a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)

@@ -107,12 +107,22 @@ class Altered:
         found = self._fits[key]
         if near is None or near.left > found.left:
             return found
+        with suppress(ConvergenceError):
+            found = min(found, self._refined(hypothesis, near, found.unknowns), key=lambda each: each.left)
+        return found
+
+    def fit_from(self, hypothesis: Hypothesis, near: AlteredFit) -> AlteredFit:
+        """Fit as `fit` does, but only from the fit of the same defect at another time. Raises ConvergenceError."""
+        key = (hypothesis.kind, hypothesis.joints, hypothesis.course)
+        if key not in self._fits:
+            self._fits[key] = self._refined(hypothesis, near, near.unknowns)
+        return self._fits[key]
+
+    def _refined(self, hypothesis: Hypothesis | None, near: AlteredFit, unknowns: Array) -> AlteredFit:
         posed = _Posed(self, hypothesis)
         value = np.array([near.values[name] for name in self.estimate.names])
-        with suppress(ConvergenceError):
-            again = posed.minimum(posed.begun(value, found.unknowns), self.problem.start(), OPTIONS.ftol)
-            found = min(found, self._result(posed, hypothesis, again), key=lambda each: each.left)
-        return found
+        found = posed.minimum(posed.begun(value, unknowns), self.problem.start(), OPTIONS.ftol)
+        return self._result(posed, hypothesis, found)
 
     def _fit(self, hypothesis: Hypothesis | None) -> AlteredFit:
         posed, estimate = _Posed(self, hypothesis), self.estimate

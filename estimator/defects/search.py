@@ -6,9 +6,10 @@ simulation with all derivatives gives the decrease in the sum of squares for eac
 (1989) 223).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -26,6 +27,7 @@ MOST_SEGMENTS = 400  # more would take too long
 EXPLAINED = 1.2  # mean square of the residual, relative to the noise, above which neighbouring instants are tried
 FITTED = 3  # number of hypotheses to fit, which differ in kind or joint
 PROMISING = 0.45  # a hypothesis that explains less than this fraction of the residual beyond the noise is dropped
+LEAST_GAIN = 1.2  # minimum factor by which a defect reduces a mean square that is below EXPLAINED
 CERTAIN = 2.0  # minimum decrease in the sum of squares, relative to that expected by chance
 LEAST = {"scale": 0.01, "load": 0.02, "friction": 0.04, "torque": 0.01, "offset": 0.01, "arm": 0.03}
 """Smallest change that matters, as a fraction of the parameters; for an offset, as a fraction of the RMS torque."""
@@ -55,6 +57,17 @@ class _Score:
     left: float
     explained: float
     evidence: float
+    gain: float
+    """Ratio of the sum of squares without the hypothesis to that with it."""
+
+    @property
+    def is_promising(self) -> bool:
+        """Whether the hypothesis deserves a fit.
+
+        A residual near the noise is nearly linear in the unknowns, so that a fit would gain little more than this test.
+        """
+        is_small = self.left * self.gain < EXPLAINED
+        return self.evidence > CERTAIN and self.explained > PROMISING and not (is_small and self.gain < LEAST_GAIN)
 
 
 def probable_defect(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool) -> Defect | None:
@@ -74,19 +87,19 @@ def probable_defect(recordings: Sequence[Recording], estimate: ShootingEstimate,
 def _searched(altered: Altered, every: Sequence[Hypothesis]) -> Defect | None:
     linear = _Linear.of(altered)
     scores = sorted((linear.score(altered, each, len(every)) for each in every), key=lambda each: each.left)
-    likely = _different([each for each in scores if each.evidence > CERTAIN and each.explained > PROMISING])
+    likely = _different([each for each in scores if each.is_promising])
     if not likely:
         return None
     given = altered.fit(None)
-    found = _best(altered, likely, given, linear.independent)
+    found = _best(altered.fit, likely, given, linear.independent)
     if found is None or found.hypothesis.course.kind != "step" or found.explained < PROMISING:
         return found
     if found.fit.left > EXPLAINED:
         near = [found.hypothesis, *_neighbours(found.hypothesis, every)]
-        found = _best(altered, near, given, linear.independent) or found
+        found = _best(partial(altered.fit_from, near=found.fit), near, given, linear.independent) or found
     # Hypotheses that place the change in different segments were compared on different data.
     then = [each for other in likely for each in every if _is_same(other, each, found.hypothesis.course)]
-    return _best(altered, then, given, linear.independent, found.fit) or found
+    return _best(partial(altered.fit, near=found.fit), then, given, linear.independent) or found
 
 
 def _is_same(hypothesis: Hypothesis, other: Hypothesis, course: Course) -> bool:
@@ -117,17 +130,13 @@ def _neighbours(hypothesis: Hypothesis, every: Sequence[Hypothesis]) -> list[Hyp
 
 
 def _best(
-    altered: Altered,
-    likely: Sequence[Hypothesis],
-    given: AlteredFit,
-    independent: float,
-    near: AlteredFit | None = None,
+    fit_of: Callable[[Hypothesis], AlteredFit], likely: Sequence[Hypothesis], given: AlteredFit, independent: float
 ) -> Defect | None:
     """Fit the `likely` hypotheses and return the most probable one. independent: number of independent samples."""
     found: list[Defect] = []
     for hypothesis in likely:
         with suppress(ConvergenceError):
-            fit = altered.fit(hypothesis, near)
+            fit = fit_of(hypothesis)
             if float(np.abs(fit.unknowns[-hypothesis.unknowns :]).max()) >= LEAST[hypothesis.kind]:
                 found.append(Defect(hypothesis, fit, given))
 
@@ -182,7 +191,8 @@ class _Linear:
         left = float(self.squares[hypothesis.used].sum()) - before
         chance = self.colour * (hypothesis.unknowns * np.log(samples) + 2.0 * np.log(tried)) * left / samples
         explained = fall / max(left - samples, 1e-6 * samples)
-        return _Score(hypothesis, max(left - fall, 0.0) / samples, explained, fall / max(float(chance), 1e-300))
+        rest = max(left - fall, 1e-6 * left)
+        return _Score(hypothesis, rest / samples, explained, fall / max(float(chance), 1e-300), left / rest)
 
     def _fall(self, base: Array, added: Array | None, hypothesis: Hypothesis) -> float:
         """Return the decrease in the sum of squares if the unknowns `base` and `added` are freed."""

@@ -131,7 +131,8 @@ class Shooting:
         """Return the simulated positions at a segment's samples (joints, samples) [rad] from `state` (2, joints)."""
         torque = self._torque(segment, physics)[0]
         step = self._grids[segment.recording].step
-        grid, end = simulate(physics, state, np.ascontiguousarray(torque[:, :, None]), step)
+        most = self._options.max_substeps
+        grid, end = simulate(physics, state, np.ascontiguousarray(torque[:, :, None]), step, most, held=True)
         return segment.at_samples(np.concatenate((grid, end[:1].T), axis=1))
 
     def position_by_values(
@@ -181,6 +182,8 @@ class Shooting:
             own.reshape(2, -1) * self.state_scale,
             (*names, *zeros, *state),
             self._grids[segment.recording].step,
+            self._options.max_substeps,
+            held=True,
         )
         # One step is appended so that the state after the last step is returned; its torque is irrelevant.
         torque, slopes = (

@@ -33,7 +33,10 @@ SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable")
 FINE = ShootingOptions()
 QUICK = ShootingOptions(ftol=1e-3, max_step=FINE.coarse_step, reweightings=1)
 """Options for fits that are only compared with each other."""
+QUICK_PRESLIDING = replace(QUICK, max_substeps=16)
+"""The same for models with presliding; few substeps, since extremely stiff bristles would always need the maximum."""
 EXPLAINED = 1.1  # ratio of residual to noise for an explained motion; the noise is estimated from the same samples
+HOPELESS = 0.3  # prediction error relative to the motion, above which a fit is useless and is not refined
 NEARLY = 1.5  # ratio of residual to noise up to which the likelihood can be trusted to choose
 
 
@@ -163,7 +166,7 @@ class _Search:
         """
         if model not in self._trials:
             began = time.perf_counter()
-            half = self.fit(model, near, FITTED, QUICK)
+            half = self.fit(model, near, FITTED, _quick(model))
             error, score = (None, np.inf) if half is None else held_out_errors(self._recordings, half, PREDICTED)
             self._trials[model] = SegmentTrial(model, error, score, time.perf_counter() - began)
         return self._trials[model]
@@ -188,7 +191,7 @@ class _Search:
             found = self.trial(near, model)
             if found.score < self._options.keep_ratio * best.score:
                 best = found
-        return self.fit(best.model, near) or plain
+        return self.fit(best.model, near, options=_final(best)) or plain
 
     def judged(self, plain: ShootingEstimate, best: ShootingEstimate) -> SegmentChoice:
         """Return the choice: `best`, or the simplest model if it predicts held-out segments much better. If no model
@@ -199,7 +202,7 @@ class _Search:
         plainest, chosen = self.trial(plain, simple), self.trial(best, best.model)
         ratio = self._options.overrule_ratio if _left(best) < EXPLAINED else 1.0
         if plainest.score < ratio * chosen.score:
-            best, chosen = self.fit(simple, plain) or best, plainest
+            best, chosen = self.fit(simple, plain, options=_final(plainest)) or best, plainest
         if not np.isfinite(chosen.score):
             raise ConvergenceError("no friction model could be fitted to half of the segments: record for longer")
         return SegmentChoice(tuple(self._trials.values()), chosen, best, plain)
@@ -240,6 +243,16 @@ class _Search:
     @property
     def _samples(self) -> float:
         return float(sum(np.isfinite(each.position).sum() for each in self._recordings))
+
+
+def _quick(model: Model) -> ShootingOptions:
+    return QUICK_PRESLIDING if "presliding" in model.options else QUICK
+
+
+def _final(chosen: SegmentTrial) -> ShootingOptions:
+    """Return the options for the final fit of the chosen model."""
+    is_hopeless = chosen.held_out is None or float(chosen.held_out.max()) > HOPELESS
+    return _quick(chosen.model) if is_hopeless else FINE
 
 
 def _left(estimate: ShootingEstimate) -> float:

@@ -44,11 +44,13 @@ LOAD, ASYMMETRY, SINE, COSINE, CYCLES, ZERO, SCALE = map(
 )
 SATURATION, CABLE, GENERATED = map(place_of, ("saturation", "cable_stiffness", "back_emf"))
 COG_SINE, COG_COSINE, COG_CYCLES = map(place_of, ("cogging_sin", "cogging_cos", "cogging_cycles"))
+STIFFNESS = place_of("presliding_stiffness")
 
 INTEGRATION = IntegrationOptions()
 MAX_SUBSTEPS = INTEGRATION.max_substeps
 FADED = 40.0  # exp(-40) is negligible compared with 1, and the library takes longer for such arguments
 GAMMA = 1.0 - math.sqrt(0.5)
+STEADY_WIDTHS = 0.25  # largest change in velocity in a substep near standstill, in widths of the Coulomb step
 
 
 def steps_per_sample(rate: float, longest: float = INTEGRATION.max_step) -> int:
@@ -63,6 +65,7 @@ def simulate(
     step: float,
     max_substeps: int = MAX_SUBSTEPS,
     springs: tuple[Array, Array] | None = None,
+    held: bool = False,
 ) -> tuple[Array, Array]:
     """Simulate as many samples as `torque` has.
 
@@ -75,6 +78,7 @@ def simulate(
         max_substeps: maximum number of substeps into which a step is divided near standstill.
         springs: stiffness of additional springs (joints,) [N m/rad] and the angles to which they pull the joints, held
             between samples (joints, samples) [rad].
+        held: whether joints that are held by friction take longer substeps.
 
     Returns:
         The angles at the samples (joints, samples) [rad] and the state after the last sample's steps (3, joints).
@@ -96,7 +100,7 @@ def simulate(
         vector[CABLE : CABLE + joints] += stiffness
         pulls[:joints] = stiffness[:, None] * ends
     moving = without_dry_friction(vector)
-    _simulate(vector, has_bristles(physics), moving, state, both, pulls, step, pieces, position)
+    _simulate(vector, has_bristles(physics), moving, state, both, pulls, step, pieces, held, position)
     return position[:joints], state[:, :joints]
 
 
@@ -107,7 +111,7 @@ def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> NDA
     numbers are powers of two, so that small changes in the physics seldom change them. A changed number would alter the
     last digits of the motion.
     """
-    needed = [min(4.0 * step / max(time, 1e-12), most) for time in physics.crossing_times()]
+    needed = [min(step / (STEADY_WIDTHS * max(time, 1e-12)), most) for time in physics.crossing_times()]
     return np.array([2 ** math.ceil(math.log2(max(each, 1.0))) for each in needed], dtype=np.int64)
 
 
@@ -175,11 +179,14 @@ def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: f
     )
 
 
-def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float, pieces: Any, left: int) -> int:
+def pieces_now(
+    p: Any, v1: float, v2: float, a1: float, a2: float, piece: float, pieces: Any, left: int, held: bool
+) -> int:
     """Return how many of the `left` remaining substeps of length `piece` [s] may be taken at once.
 
     v1, v2: velocities [rad/s]. a1, a2: last accelerations [rad/s^2]. pieces: number of substeps in a step while each
-    joint is near standstill (joints,); a substep is a step divided by the larger of them.
+    joint is near standstill (joints,); a substep is a step divided by the larger of them. held: whether a joint that is
+    held by friction may take longer ones.
     """
     ahead = 2.0 * left * piece
     u1, u2 = v1 + ahead * a1, v2 + ahead * a2
@@ -187,11 +194,29 @@ def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float,
     near_2 = (p[COULOMB + 1] > 0.0) & ((min(abs(v2), abs(u2)) < 6.0 * p[WIDTH + 1]) | (v2 * u2 < 0.0))
     finest = max(pieces[0], pieces[1])
     at_once = left
+    # The last acceleration does not include the effect of a new torque, so each step starts with a short substep.
     if near_1:
-        at_once = min(at_once, finest // pieces[0])
+        steady = pieces_while_steady(p, 0, a1, piece, left) if held and left < finest else 1
+        at_once = min(at_once, max(steady, finest // pieces[0]))
     if near_2:
-        at_once = min(at_once, finest // pieces[1])
+        steady = pieces_while_steady(p, 1, a2, piece, left) if held and left < finest else 1
+        at_once = min(at_once, max(steady, finest // pieces[1]))
     return at_once
+
+
+def pieces_while_steady(p: Any, joint: int, a: float, piece: float, left: int) -> int:
+    """Return how many of the `left` remaining substeps change a joint's velocity by no more than a substep of
+    `finer_pieces` may.
+
+    A joint held by dry friction needs no short substeps, since the method is L-stable for the slope of friction.
+    Bristles always need them, since they oscillate. a: last acceleration [rad/s^2].
+    """
+    if p[STIFFNESS + joint] > 0.0:
+        return 1
+    most = STEADY_WIDTHS * p[WIDTH + joint]
+    while left > 1 and abs(a) * left * piece > most:
+        left //= 2
+    return left
 
 
 def step_on(
@@ -249,7 +274,16 @@ def step_bent(
 
 # pulls: torques of the springs if the joints were at zero (2, samples) [N m], or (2, 0) without springs.
 def _loop(
-    p: Any, bristly: bool, m: Any, state: Any, torque: Any, pulls: Any, step: float, pieces: Any, position: Any
+    p: Any,
+    bristly: bool,
+    m: Any,
+    state: Any,
+    torque: Any,
+    pulls: Any,
+    step: float,
+    pieces: Any,
+    held: bool,
+    position: Any,
 ) -> None:
     q1, q2, v1, v2 = state[0, 0], state[0, 1], state[1, 0], state[1, 1]
     b = state[2]
@@ -267,7 +301,7 @@ def _loop(
             t1, t2 = torque[0, k, s], torque[1, k, s]
             left = finest
             while left > 0:
-                n = pieces_now(p, v1, v2, a1, a2, piece, pieces, left)
+                n = pieces_now(p, v1, v2, a1, a2, piece, pieces, left, held)
                 q1, q2, v1, v2, a1, a2 = step_bent(p, bristly, m, b, q1, q2, v1, v2, a1, a2, t1, t2, n * piece)
                 left -= n
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
@@ -275,7 +309,7 @@ def _loop(
 
 # Functions called only from compiled code need no wrappers, which take a second to compile. They are inlined because
 # the reference counting for their arrays would take longer than the arithmetic of a step.
-bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent = map(
-    inlined, (bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent)
+bump_at, bend_at, _drive, _forces, pieces_while_steady, pieces_now, step_on, step_bent = map(
+    inlined, (bump_at, bend_at, _drive, _forces, pieces_while_steady, pieces_now, step_on, step_bent)
 )
 _simulate: Callable[..., None] = compiled(_loop)

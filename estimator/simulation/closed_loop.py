@@ -229,7 +229,7 @@ def _loop(
             t2 += (c2 - t2) * fallen2
             left = finest
             while left > 0:
-                n = pieces_now(p, v1, v2, a1, a2, piece, pieces, left)
+                n = pieces_now(p, v1, v2, a1, a2, piece, pieces, left, False)
                 q1, q2, v1, v2, a1, a2 = step_bent(p, bristly, m, b, q1, q2, v1, v2, a1, a2, m1, m2, n * piece)
                 left -= n
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2

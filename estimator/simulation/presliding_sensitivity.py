@@ -64,8 +64,9 @@ class PreslidingSensitive(Sensitive):
         step: float,
         max_substeps: int = MAX_SUBSTEPS,
         tracking_stiffness: Array | None = None,
+        held: bool = False,
     ) -> None:
-        super().__init__(physics, start, causes, step, max_substeps, tracking_stiffness)
+        super().__init__(physics, start, causes, step, max_substeps, tracking_stiffness, held)
         *room, at = self._room
         # Dry friction is modelled by the bristles: within the arm's step its derivatives are discarded.
         within = at.copy()
@@ -213,6 +214,7 @@ def _loop(
     ends: Any,
     step: float,
     pieces: Any,
+    held: bool,
     room: Any,
     Z: Any,
     turn: Any,
@@ -239,7 +241,7 @@ def _loop(
                 dt[cause, 0], dt[cause, 1] = slopes[cause, 0, k, s], slopes[cause, 1, k, s]
             left = finest
             while left > 0:
-                n = pieces_now(p, x[1, 0], x[1, 1], faster[0], faster[1], piece, pieces, left)
+                n = pieces_now(p, x[1, 0], x[1, 1], faster[0], faster[1], piece, pieces, left, held)
                 h = n * piece
                 _bend(p, m, b, bristles, x, t1, t2, 0.5 * h, 0.5 * h, dt, Z, count)
                 _clear(rows, now)

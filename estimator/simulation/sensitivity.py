@@ -84,6 +84,7 @@ class Sensitive:
     step: length of an integration step [s].
     max_substeps: maximum number of substeps into which a step is divided near standstill.
     tracking_stiffness: stiffness of additional springs that pull the joints to given angles (joints,) [N m/rad].
+    held: whether joints that are held by friction take longer substeps.
     """
 
     def __init__(
@@ -94,12 +95,14 @@ class Sensitive:
         step: float,
         max_substeps: int = MAX_SUBSTEPS,
         tracking_stiffness: Array | None = None,
+        held: bool = False,
     ) -> None:
         self._joints = start.shape[1]
         self._count = len(causes)
         self._constants = physics.vector
         self._step = step
         self._pieces = finer_pieces(physics, step, max_substeps)
+        self._held = held
         self._state = np.zeros((2, 2))
         self._state[:, : self._joints] = start
         self._places: npt.NDArray[np.int64] = np.full(len(CAUSES), NOWHERE)
@@ -144,7 +147,7 @@ class Sensitive:
         position = np.empty((2, samples))
         derivative = np.empty((2, samples, self._count))
         self._go_on(
-            *(self._constants, self._state, both, slopes, ends, self._step, self._pieces),
+            *(self._constants, self._state, both, slopes, ends, self._step, self._pieces, self._held),
             *(self._room, self._z, self._turn, position, derivative),
         )
         return position[:joints], derivative[:joints]
@@ -403,6 +406,7 @@ def _loop(
     ends: Any,
     step: float,
     pieces: Any,
+    held: bool,
     room: Any,
     Z: Any,
     turn: Any,
@@ -427,7 +431,7 @@ def _loop(
                 dt[cause, 0], dt[cause, 1] = slopes[cause, 0, k, s], slopes[cause, 1, k, s]
             left = finest
             while left > 0:
-                n = pieces_now(p, x[1, 0], x[1, 1], a1, a2, piece, pieces, left)
+                n = pieces_now(p, x[1, 0], x[1, 1], a1, a2, piece, pieces, left, held)
                 a1, a2 = arm_step(p, x, t1, t2, n * piece, now, room)
                 left -= n
                 now = 1 - now
