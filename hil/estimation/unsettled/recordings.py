@@ -59,14 +59,14 @@ def _estimate_planar(
     columns, gravity = read.columns, config.arm.gravity
     zeros = (columns.zeros_unknown or config.model.zeros) and gravity > 0.0
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
+    lengths, joints = config.arm.link_lengths, read.recordings[0].joints
+    if lengths is not None and len(lengths) != joints:
+        raise ConfigError(f"{shown}: arm.link_lengths: give one length per position column ({joints}).")
     refuse_stuck(read.recordings, ", ".join(map(str, paths)), columns.segment)
     zero_is_set = config.columns.zero is not None
     refuse_slips(read.recordings, ", ".join(map(str, paths)), columns.zero, zero_is_set)
     jumps = jump_sentences(whole.recordings, whole.names, whole.stepped)
     repeats = all(one is not mean for one, mean in zip(whole.recordings, read.recordings, strict=True))
-    lengths, joints = config.arm.link_lengths, read.recordings[0].joints
-    if lengths is not None and len(lengths) != joints:
-        raise ConfigError(f"{shown}: arm.link_lengths: give one length per position column ({joints}).")
     length = link_length(config.known, config.arm)
     origin, brakes = tuple(columns.zero or ()), _brakes(columns)
     given = Given(names=read.names, jumps=jumps, origin=origin, repeats=repeats, length=length, brakes=brakes)

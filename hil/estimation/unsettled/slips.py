@@ -83,9 +83,10 @@ def _refuse_units(recordings: Sequence[Recording], source: str, zero: Sequence[f
     if found is None or not _is_clear(found.residual, found.residual_given):
         return
     raise CsvError(
-        f"{source}: the angles were read as {found.stated} but seem to be in {found.true}: in {found.true}, "
-        f"{unexplained(found.residual, found.residual_given)}. Correct the unit in the headers of the columns, or set "
-        f'position_unit = "{found.true}" in [columns] of --config ARM.toml.'
+        f"{source}: the angles seem to be in another unit than stated, as if {found.true} had been read as "
+        f"{found.stated}: with the angles in {found.true}, {unexplained(found.residual, found.residual_given)}. "
+        f'Correct the unit in the headers of the columns, or set position_unit = "{found.true}" in [columns] of --config '
+        "ARM.toml."
     )
 
 

@@ -197,5 +197,5 @@ def test_angles_in_another_unit_are_named(stated: str, true: str) -> None:
     motion, zero = two_joints(12.0), np.array([[0.4], [-0.3]])
     factor = signs.ANGLE_UNITS[stated] / signs.ANGLE_UNITS[true]
     given = Recording(motion.time, motion.torque, factor * (motion.position - zero) + zero, np.full(2, 1e-4), "held")
-    with pytest.raises(CsvError, match=f'read as {stated} but seem to be in {true}.*position_unit = "{true}"'):
+    with pytest.raises(CsvError, match=f'as if {true} had been read as {stated}.*position_unit = "{true}"'):
         refuse_slips([given], "arm.csv", (0.4, -0.3))
