@@ -85,8 +85,8 @@ def _refuse_units(recordings: Sequence[Recording], source: str, zero: Sequence[f
     raise CsvError(
         f"{source}: the angles seem to be in another unit than stated, as if {found.true} had been read as "
         f"{found.stated}: with the angles in {found.true}, {unexplained(found.residual, found.residual_given)}. "
-        f'Correct the unit in the headers of the columns, or set position_unit = "{found.true}" in [columns] of --config '
-        "ARM.toml."
+        f'Correct the unit in the headers of the columns, or set position_unit = "{found.true}" in [columns] of '
+        "--config ARM.toml."
     )
 
 
