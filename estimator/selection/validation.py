@@ -87,14 +87,20 @@ def validate(period: SettledPeriod, estimate: Estimate, gravity: bool = True) ->
         _free_run(period, estimate),
         float(linalg.cond(correlation)),
         (names[first], names[second], float(correlation[first, second])),
-        relative_errors(names, estimate.value, estimate.std, *_rms(period), gravity),
+        relative_errors(names, estimate.value, estimate.std, *_rms(period), gravity, little_friction=0.0),
         _torque_std(period, estimate),
         levels(period, estimate),
     )
 
 
 def relative_errors(
-    names: tuple[str, ...], value: Array, std: Array, torque: Array, speed: Array, gravity: bool = True
+    names: tuple[str, ...],
+    value: Array,
+    std: Array,
+    torque: Array,
+    speed: Array,
+    gravity: bool = True,
+    little_friction: float = LITTLE_TORQUE,
 ) -> dict[str, float]:
     """Return the relative standard error of each base parameter except offsets and, without gravity, gravity torques.
 
@@ -106,13 +112,16 @@ def relative_errors(
         value, std: their values and standard errors, optionally followed by those of other parameters [SI].
         torque, speed: RMS torque and velocity of each joint (joints,) [SI].
         gravity: whether gravity acts in the arm's plane.
+        little_friction: fraction of the RMS torque below which friction is negligible; 0 for a designed excitation,
+            which determines even slight friction.
     """
     relative = {}
     for name, each, error in zip(names, map(float, value), map(float, std), strict=False):
         kind, joint = kind_of(name), (joint_of(name) or 1) - 1
         if kind == "offset" or (kind == "gravity" and not gravity):
             continue
-        size = max(abs(each), _negligible(kind, LITTLE_TORQUE * float(torque[joint]), float(speed[joint])))
+        share = LITTLE_TORQUE if kind == "gravity" else little_friction
+        size = max(abs(each), _negligible(kind, share * float(torque[joint]), float(speed[joint])))
         relative[name] = error / size if size else np.inf
     return relative
 
