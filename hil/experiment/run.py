@@ -17,7 +17,7 @@ from hil.drivers.errors import BusShared, DriverError, PortLost, ServoFault, Tor
 from hil.drivers.servo import LATE
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested, Unheard
+from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested, Unheard, symptom_of
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.experiment.guard import MOST_OUTSIDE_RAD
 from hil.experiment.model_watch import UNLIKE_ANY_ARM
@@ -291,7 +291,7 @@ def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, 
     explained = stop if isinstance(stop, SafetyStop) and stop.cause in EXPLAINED else None
     if explained is not None and (changed := changed_settings(before, now, explained.cause)):
         later = may_be_later(before, now, explained.cause, modes_seen_ago)
-        explained.args = (f"{explained} {later}" if later else f"{changed} Symptom: {explained}",)
+        explained.args = (f"{explained} {later}" if later else f"{changed} Symptom: {symptom_of(explained)}.",)
         explained.overruled = True
     elif changed := changed_settings(before, now):
         error.add_note(changed)

@@ -40,7 +40,9 @@ def test_settings_that_another_program_changed_are_the_cause_that_is_named(
     happens = once(lambda: rewritten(ports, register, value))
     stop, _ = run_until_stopped(arm(), tmp_path / "run", happens, plan)
     assert str(stop).startswith("Another program changed the settings of a servo during the run (joint 'elbow'")
-    assert f"{register} from 0 to {value}" in str(stop) and "Symptom: " in str(stop)
+    assert f"{register} from 0 to {value}" in str(stop)
+    symptom = str(stop).partition("Symptom: ")[2]
+    assert symptom and ". " not in symptom, "what happened, without other causes"
     assert stop.overruled
     assert_stopped(ports[0])
 
