@@ -48,6 +48,7 @@ WORDS = {
     MIXED: r"another servo's|mixed up|swapped|ID has changed|same ID|was not addressed:",
     REPEATED: r"repeated|too late or twice",
     SETTING: r"changed the settings.{0,80}(Homing Offset|Return (Delay Time|Level)|(PWM|Current) Limit|Secondary.*) is"
+    r"|changed the settings.{0,80}((PWM|Current) Limit|Goal PWM) from"
     r"|(Homing Offset|Return Delay Time|PWM Limit) was changed during this|Current Limit is \d+, but current_limit",
     HAND: r"pushes or holds|pushing or holding|hit it|slips|begun to slip",
     DISK: r"\bdisk\b|no space|File too large|cannot be written",
@@ -94,7 +95,7 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.MODE_TAKEN: _OTHER_GOALS,
     Kind.ANSWERS_LESS: frozenset({SILENCE}),
     Kind.RAISED_LIMIT: frozenset(),
-    Kind.LOWERED_LIMIT: _LOST_GOALS | {LIMIT, SETTING},
+    Kind.LOWERED_LIMIT: _LOST_GOALS | {LIMIT, SETTING, STRANGER},  # as THROTTLED, written by another program
     Kind.WATCHDOG_OFF: frozenset({TORQUE, STRANGER}),
     Kind.WATCHDOG_LONG: frozenset({TORQUE, STRANGER}),
     Kind.TURNED_ROUND: _FORGED | {LIMIT, POSE, REFUSED, STRANGER},
@@ -122,7 +123,7 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.RIVAL: _OTHER_GOALS,
     Kind.FACTORY_RESET: frozenset({SILENCE, REBOOT, TORQUE}),
     Kind.SHADOWED: _OTHER_GOALS | {SETTING},
-    Kind.THROTTLED: _BY_MOTOR,
+    Kind.THROTTLED: _BY_MOTOR | {SETTING, STRANGER},
     Kind.HOMING_MOVED: _FORGED | {LIMIT, POSE, SETTING, STRANGER},  # only another program writes it
     Kind.SLIP: _BY_HAND,
     Kind.OBSTACLE: _BY_HAND,
