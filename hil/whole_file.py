@@ -1,10 +1,11 @@
 """Files that are written completely or not at all."""
 
+from contextlib import suppress
 from pathlib import Path
 
 from hil.errors import RunFolderError
 
-__all__ = ["write_whole"]
+__all__ = ["replace_file", "write_whole"]
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -21,8 +22,18 @@ def write_whole(path: Path, text: str) -> None:
             with path.open("w", encoding="utf-8") as stream:
                 stream.write(text)
             return
-        temporary = target.with_name(target.name + ".partial")
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(target)
     except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+    replace_file(target, text)
+
+
+def replace_file(path: Path, text: str) -> None:
+    """Write a regular file, or replace it. Raises RunFolderError."""
+    temporary = path.with_name(path.name + ".partial")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            temporary.unlink()
         raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error

@@ -233,14 +233,14 @@ def suspect_unit(recordings: Sequence[Recording], zero: Sequence[float] = ()) ->
     zero: zeros [rad] that the angles include, by default 0.
     """
     zeros = np.zeros(recordings[0].joints) if not len(zero) else np.array(zero)
-    found = []
-    for (stated, given), (true, other) in permutations(ANGLE_UNITS.items(), 2):
+    given, found = _fit_as_given(recordings), []
+    for (stated, unit), (true, other) in permutations(ANGLE_UNITS.items(), 2):
         try:
-            scaled = [_in_unit(each, zeros, other / given) for each in recordings]
+            scaled = [_in_unit(each, zeros, other / unit) for each in recordings]
         except RecordingError:  # angles that no joint has
             continue
         # The filter biases friction if the motion is fast.
-        evidence = _better_explained(recordings, _zeroed(scaled), ("inertia",))
+        evidence = _better_than(given, _zeroed(scaled), ("inertia",))
         if evidence is not None:
             found.append(OtherUnit(stated, true, *evidence))
     return min(found, key=lambda each: each.residual, default=None)
@@ -259,16 +259,18 @@ def _zeroed(recordings: Sequence[Recording]) -> Sequence[Recording]:
     return [replace(each, position=each.position + zeros[:, None]) for each in recordings]
 
 
-def _better_explained(
-    recordings: Sequence[Recording], changed: Sequence[Recording], positive: tuple[str, ...] = _POSITIVE
-) -> tuple[float, float] | None:
+def _better_explained(recordings: Sequence[Recording], changed: Sequence[Recording]) -> tuple[float, float] | None:
     """Return the worst joint's relative RMS torque residual, first with the changed recordings, then with the given
     ones; None if the change does not explain them much better.
-
-    positive: kinds of parameters that must not be negative.
     """
-    as_given = Signs((1,) * recordings[0].joints, (1,) * recordings[0].joints)
-    given, fitted = _fit(recordings, as_given), _fit(changed, as_given)
+    return _better_than(_fit_as_given(recordings), changed)
+
+
+def _better_than(
+    given: InverseDynamics | None, changed: Sequence[Recording], positive: tuple[str, ...] = _POSITIVE
+) -> tuple[float, float] | None:
+    """The same for a fit to the recordings as given. positive: kinds of parameters that must not be negative."""
+    fitted = _fit_as_given(changed)
     if given is None or fitted is None or any(name.startswith(positive) for name in _impossible(fitted)):
         return None
     residual, left = float(fitted.relative_residual.max()), float(given.relative_residual.max())
@@ -301,8 +303,13 @@ def _fit(recordings: Sequence[Recording], signs: Signs) -> InverseDynamics | Non
         return None
 
 
+def _fit_as_given(recordings: Sequence[Recording]) -> InverseDynamics | None:
+    as_given = (1,) * recordings[0].joints
+    return _fit(recordings, Signs(as_given, as_given))
+
+
 def _fit_unzeroed(recordings: Sequence[Recording], signs: Signs) -> InverseDynamics | None:
-    return _fit(_zeroed(with_signs(recordings, signs)), Signs(*((1,) * len(signs.torque),) * 2))
+    return _fit_as_given(_zeroed(with_signs(recordings, signs)))
 
 
 def _impossible(fitted: InverseDynamics) -> tuple[str, ...]:

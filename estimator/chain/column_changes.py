@@ -17,7 +17,9 @@ from typing import Literal
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.baselines.signs import ANGLE_UNITS
 from hil.estimator.chain.column_faults import FACTORS, TIMES, ColumnCheck, Normal, Solved
+from hil.estimator.chain.description_faults import ZEROS
 from hil.estimator.chain.fit.regression import filtered_torques
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -37,8 +39,6 @@ WELL, NEAR = 0.12, 0.1
 """Largest relative torque residual with a change, and largest squared distance per base parameter between the result
 and the description, in units of the description's uncertainty.
 """
-ZEROS = tuple(np.radians([90.0, -90.0, 180.0]).tolist())
-UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "turns": 2.0 * np.pi}
 RATIOS = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.8, 1.25, 1.5, 2.0, 3.0, 4.0)  # of an angle to the true one
 FINE = (1.12, 1.06, 1.03, 1.015)  # factors by which to refine the best ratio, in turn
 ROUND = 0.02  # relative difference up to which a ratio of small whole numbers is preferred
@@ -117,7 +117,7 @@ class ColumnSearch:
     """Recordings whose columns may be wrong.
 
     links: described link parameters (joints, 10) [SI]. zero: `columns.zero`, which the angles include (joints,) [rad].
-    gains: torque per unit of each torque column (joints,). unit: unit of the angles, if it is one of `UNITS`.
+    gains: torque per unit of each torque column (joints,). unit: unit of the angles, if it is one of `ANGLE_UNITS`.
     """
 
     check: ColumnCheck
@@ -234,13 +234,13 @@ def _changes(joints: int, unit: str) -> Iterator[ColumnChange]:
         if joints > 1:
             yield ColumnChange("direction", tuple(range(joints)), columns)
     for joint in range(joints):
-        for turned in ZEROS:
+        for turned in ZEROS.tolist():
             yield ColumnChange("zero", (joint,), turned=turned)
         for ratio in RATIOS:
             yield ColumnChange("ratio", (joint,), factor=ratio)
-    for stated, true in permutations(UNITS, 2):
+    for stated, true in permutations(ANGLE_UNITS, 2):
         if stated == unit:
-            yield ColumnChange("unit", factor=UNITS[true] / UNITS[stated], units=(stated, true))
+            yield ColumnChange("unit", factor=ANGLE_UNITS[true] / ANGLE_UNITS[stated], units=(stated, true))
 
 
 def _is_same(one: ColumnChange | None, other: ColumnChange | None) -> bool:

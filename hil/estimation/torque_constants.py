@@ -66,7 +66,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
         )
         return " ".join(sentence for sentence in (known if unsure else "", silent) if sentence)
     first = joints[0]
-    given = _capitalised(_relative(first.name, ratios, "constant"))
+    given = capitalised(_relative(first.name, ratios, "constant"))
     found = f"{given}. All values scale with the torque constant of {first.name} alone"
     if not first.torque_per_goal_std:
         return f"{found}, whose uncertainty is not given."
@@ -120,11 +120,12 @@ def ratios_said(
     ratios = [(joint, ratio) for joint, _, ratio in _ratios(joints, extra)]
     if not ratios or without:
         return ()
-    stated = _capitalised(_relative(joints[0], ratios, source))
+    stated = capitalised(_relative(joints[0], ratios, source))
     return (f"{stated}. The values of all joints are relative to the torque of {joints[0]}.",)
 
 
-def _capitalised(sentence: str) -> str:
+def capitalised(sentence: str) -> str:
+    """Return a sentence with its first letter in upper case."""
     return sentence[0].upper() + sentence[1:]
 
 

@@ -41,6 +41,7 @@ from hil.plan.plan import Plan
 from hil.results.json_form import FormError, from_json, to_json
 from hil.results.result import Result
 from hil.toml_file import TomlFileError, read_toml_text
+from hil.whole_file import replace_file
 
 __all__ = ["SCHEMA", "Excitation", "RunFacts", "RunFolder", "RunRecord", "taken", "write_json"]
 
@@ -406,14 +407,7 @@ def _versions() -> dict[str, str]:
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Write a JSON file completely or not at all. Raises RunFolderError."""
-    temporary = path.with_suffix(".partial")
-    try:
-        temporary.write_text(strict_json.dumps(value, indent=2) + "\n", encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            temporary.unlink()
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+    replace_file(path, strict_json.dumps(value, indent=2) + "\n")
 
 
 def _read_json(path: Path) -> dict[str, Any]:

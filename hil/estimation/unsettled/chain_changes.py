@@ -8,6 +8,7 @@ import numpy as np
 
 from hil.config.csv_columns import Columns
 from hil.description.arm import ArmDescription
+from hil.estimation.torque_constants import capitalised
 from hil.estimation.unsettled.slips import unexplained
 from hil.estimator.chain.column_changes import ColumnChange, ColumnSearch, Suspected
 from hil.estimator.chain.column_faults import ColumnCheck
@@ -29,13 +30,13 @@ class ChangedColumns:
     @property
     def refusal(self) -> str:
         """A sentence on why there is no estimate, and one on what to do."""
-        return f"{self.what}: with this corrected, {unexplained(*self.residuals)}. {_capital(self.remedy)}."
+        return f"{self.what}: with this corrected, {unexplained(*self.residuals)}. {capitalised(self.remedy)}."
 
     def said(self, description: str) -> tuple[str, ...]:
         """Sentences for the verdict. description: name of the file that describes the arm."""
         return (
             f"The recording contradicts {description}: {self.what}; with this corrected, the two agree. "
-            f"{_capital(self.remedy)}, and estimate again; the recording remains usable.",
+            f"{capitalised(self.remedy)}, and estimate again; the recording remains usable.",
         )
 
 
@@ -134,7 +135,3 @@ def _quoted(name: str) -> str:
 def _wrapped(angle: float) -> float:
     """Return the angle in (-pi, pi] [rad]."""
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

@@ -136,13 +136,20 @@ def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> bool:
     not be. Raises PortLost and, once all other servos have been restored, the error of `recover` for the needed servo
     if it answers.
     """
+    try:
+        return _recover_all(port, needed, say)
+    except (PortLost, KeyboardInterrupt) as ended:
+        ended.add_note(not_restored(port))
+        raise
+
+
+def _recover_all(port: Port, needed: int, say: Callable[[str], None]) -> bool:
     failed: dict[Servo, DriverError] = {}
     was_on: dict[Servo, bool] = {}
     for servo in _on_file(port):
         try:
             was_on[servo] = _switched_off(servo)
-        except (PortLost, KeyboardInterrupt) as ended:
-            ended.add_note(not_restored(port))
+        except PortLost:
             raise
         except DriverError as error:
             failed[servo] = error
@@ -150,8 +157,7 @@ def recover_all(port: Port, needed: int, say: Callable[[str], None]) -> bool:
         try:
             if said := _restored(recover_patiently(servo, port.url), is_cut):
                 say(f"{servo.title}: {said}")
-        except (PortLost, KeyboardInterrupt) as ended:
-            ended.add_note(not_restored(port))
+        except PortLost:
             raise
         except DriverError as error:
             failed[servo] = error
