@@ -22,7 +22,7 @@ from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.read_back_exchange import ReadBackExchange
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, with_article
-from hil.drivers.state import NAN, SETTINGS, Converter, State, fold, read_back_spans, spans
+from hil.drivers.state import LIMITS, NAN, SETTINGS, Converter, State, fold, read_back_spans, spans
 from hil.drivers.sync_read import Answer, Span, SyncRead
 from hil.drivers.torque.held import LetDown, Originals, held_servos, let_sink, refuse_held
 from hil.drivers.torque.switch import TorqueSwitch
@@ -243,8 +243,10 @@ class ServoBus(TorqueSwitch):
     def add_read_back(self, exchange: ReadBackExchange) -> None:
         """Make `exchange` read back the servos' goals, Torque Enable, and the settings that must not change."""
         modes = [drive.mode for drive in self._drives]
-        settings = [[servo.read(name) for name in SETTINGS] for servo in self._servos.values()]
-        exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in self._servos.values()]), settings)
+        servos = self._servos.values()
+        settings = [[servo.read(name) for name in SETTINGS] for servo in servos]
+        limits = [[servo.read(name) for name in LIMITS[mode]] for mode, servo in zip(modes, servos, strict=True)]
+        exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in servos]), settings, limits)
 
     def knows_fast_sync_read(self) -> bool:
         """Return whether every servo's firmware supports Fast Sync Read."""

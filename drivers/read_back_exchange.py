@@ -38,14 +38,15 @@ class ReadBackExchange(Exchange):
         mode: Span | Sequence[Span],
         torque: Span | Sequence[Span],
         modes: Sequence[Sequence[int]],
+        limits: Sequence[Sequence[int]],
     ) -> None:
         """Prepare the read-backs made by `overruled` (see `ReadBack`).
 
-        goal: spans of Bus Watchdog and goal. mode: spans that end with the settings. modes: each servo's settings.
-        torque: spans that begin with Torque Enable.
+        goal: spans of Bus Watchdog, limits of the motor's output, and goal. mode: spans that end with the settings.
+        torque: spans that begin with Torque Enable. modes, limits: each servo's settings and limits.
         """
         back = self._read_back = ReadBack(
-            *(self.ids, goal, mode, modes, torque),
+            *(self.ids, goal, mode, modes, torque, limits),
             watches_torque=not self._shows_torque,
             interval=self._interval,
             fast=self.fast,

@@ -134,15 +134,20 @@ rebooting the servo.
 """
 
 
+LIMITS = {Mode.CURRENT: ("Goal PWM",), Mode.PWM: ()}
+"""Registers between Bus Watchdog and goal that limit the motor's output. In current mode, Goal PWM limits its voltage.
+"""
+
+
 def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans, Spans]:
-    """Return three spans of registers: the first ends with the goal, the second ends with SETTINGS, and the third
-    begins with Torque Enable.
+    """Return three spans of registers: the first consists of Bus Watchdog, LIMITS and the goal, the second ends with
+    SETTINGS, and the third begins with Torque Enable.
 
     The spans cover more addresses than necessary, so that answers to these reads differ in length from answers to the
     usual requests of other programs.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
-    goals = [_status_names(own)[:2] for own in modes]
+    goals = [("Bus Watchdog", *LIMITS[own], own.goal_register) for own in modes]
     goal = Span.of(tables, goals[0]) if len(set(modes)) == 1 else Span.each(tables, goals)
     return goal, Span.of(tables, ("ID", "Baud Rate", "Return Delay Time", *SETTINGS)), Span.of(tables, _DRIVEN)
 

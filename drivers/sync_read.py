@@ -6,6 +6,7 @@ refused; None if it did not reply. ERR holds a StatusError in its low bits and A
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from struct import Struct
 from typing import Protocol
 
@@ -87,12 +88,11 @@ class Span:
 
 
 def one_each(span: Span | Sequence[Span], count: int) -> tuple[Span, ...]:
-    """Return one span per servo; raises ValueError unless all have the same addresses and number of registers."""
+    """Return one span per servo; raises ValueError unless all cover the same addresses."""
     spans = (span,) * count if isinstance(span, Span) else tuple(span)
-    if len(spans) != count or len({(each.address, each.size, len(each.registers)) for each in spans}) != 1:
+    if len(spans) != count or len({(each.address, each.size) for each in spans}) != 1:
         raise ValueError(
-            f"reading {count} servos together needs one span per servo, all with the same addresses and number of "
-            f"registers: {spans}"
+            f"reading {count} servos together needs one span per servo, all with the same addresses: {spans}"
         )
     return spans
 
@@ -149,16 +149,16 @@ class SyncRead:
         behind_id = (span.size + 4).to_bytes(2, "little") + bytes((Instruction.STATUS,))
         # Unpack all answers at once: per servo the eight bytes up to INST as one number, ERR, the values, the CRC.
         self._unpack = Struct("<" + "".join(f"QB{own.format}H" for own in spans)).unpack
-        width = len(span.registers) + 3
+        widths = [len(own.registers) + 3 for own in spans]
         self._parts = [
             (
                 int.from_bytes(HEADER + bytes((servo_id,)) + behind_id, "little"),
                 slice(n * length, (n + 1) * length - 2),
-                n * width,
-                slice(n * width + 1, (n + 1) * width - 1),
-                (n + 1) * width - 1,
+                end - width,
+                slice(end - width + 1, end - 1),
+                end - 1,
             )
-            for n, servo_id in enumerate(self._ids)
+            for n, (servo_id, width, end) in enumerate(zip(ids, widths, accumulate(widths), strict=True))
         ]
 
     def unpack(self, received: bytes) -> list[Answer] | None:
@@ -224,7 +224,8 @@ class FastSyncRead:
         span = spans[0]
         # Unpack all parts at once: per servo its ERR and values.
         self._whole = Struct("<8x" + "".join(f"Bx{own.format}2x" for own in spans))
-        self._width = len(span.registers) + 1
+        widths = [len(own.registers) + 1 for own in spans]
+        self._answers = [slice(end - width, end) for width, end in zip(widths, accumulate(widths), strict=True)]
         self.request = _request(Instruction.FAST_SYNC_READ, ids, span)
         part = self._part = span.size + 4  # ERR, ID, data, CRC
         self._id_bytes = bytes(ids)
@@ -245,11 +246,14 @@ class FastSyncRead:
             or _crc(received[:-2]) != received[-2] | received[-1] << 8
         ):
             return None
-        fields, width = self._whole.unpack(received), self._width
-        for error in fields[::width]:
-            if error & _ERROR_BITS:
+        fields = self._whole.unpack(received)
+        answers: list[Answer] = []
+        for own in self._answers:
+            answer = fields[own]
+            if answer[0] & _ERROR_BITS:
                 return None
-        return [fields[at : at + width] for at in range(0, len(fields), width)]
+            answers.append(answer)
+        return answers
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
         packet = self._packet(received)

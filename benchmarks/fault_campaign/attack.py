@@ -103,6 +103,12 @@ ON_TIME = frozenset({Kind.RIVAL, Kind.HICCUPS})
 AT_ONCE = frozenset(set(Kind) - ON_REPLIES - FORGED - ON_INSTRUCTIONS - ON_MOTORS - ON_TIME - {Kind.ECHO})
 """Attacks that happen once, at their start time."""
 
+ON_PROGRAM = frozenset({Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP, Kind.KILLED, Kind.STALL, Kind.SUSPENDED}) | {
+    Kind.DISK_FULL,
+    Kind.CLOCK_SET,
+}
+"""Attacks that happen once and take effect only while the program runs."""
+
 
 @dataclass(frozen=True)
 class Attack:

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.fault_campaign.attack import (
-    Attack,
     Kind,
     Request,
     blocks_in,
@@ -132,7 +131,7 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     bound = BOUND_MS
     if set(drawn.kinds) & UNHEARD:
         bound = max(bound, 1e3 * config.safety.watchdog + TRIP_MS)
-    again = [acts_at(attack, drawn.attacks) for attack in drawn.attacks if attack.kind == Kind.MODE_TAKEN]
+    again = [attack.start for attack in drawn.attacks if attack.kind == Kind.MODE_TAKEN]
     since = since_again(time[driven], since, again)
     late_ms, unseen = _flowed_ms(time[driven], since), False
     plain = min([when for what, when in reasons if not what.endswith(TO_BE_SEEN)], default=np.inf)
@@ -228,12 +227,6 @@ def addressed(config: Config, record: NDArray[Any], joint: int) -> NDArray[Any]:
     has_id = record["id"] == config.joints[joint].id
     servo = np.where(has_id.any(axis=1), has_id.argmax(axis=1), joint)
     return np.asarray(record[np.arange(len(record)), servo])
-
-
-def acts_at(attack: Attack, attacks: Sequence[Attack]) -> float:
-    """Time at which an attack takes effect [s]: at its start or, if the program is suspended, once it resumes."""
-    stops = [each for each in attacks if each.kind in (Kind.STALL, Kind.SUSPENDED) and each.start <= attack.start]
-    return max([attack.start, *(each.start + each.amount for each in stops)])
 
 
 def since_again(driven: NDArray[np.float64], since: float, again: list[float]) -> float:
@@ -342,17 +335,19 @@ def _not_before(what: str, when: float, helpless: Sequence[tuple[float, float]])
 
 
 def stopped_unwatched(drawn: Drawn) -> list[tuple[float, float]]:
-    """Return when the program was suspended just after another program had disarmed the watchdogs: (start, end) [s].
+    """Return when the program was suspended just before or after another program disarmed the watchdogs: (start, end)
+    [s].
 
     Neither a suspended program nor a disarmed watchdog can end the current. If the program is suspended before it can
-    be expected to have noticed the disarmed watchdogs, nothing can end the current until the program runs again.
+    be expected to have noticed the disarmed watchdogs, or if they are disarmed while it is suspended, nothing can end
+    the current until the program runs again.
     """
     disarmed = [each.start for each in drawn.attacks if each.kind in (Kind.WATCHDOG_OFF, Kind.WATCHDOG_LONG)]
     return [
         (each.start - 1e-3 * UNSURE_MS, each.start + each.amount)
         for each in drawn.attacks
         if each.kind in (Kind.STALL, Kind.SUSPENDED, Kind.HICCUPS)
-        and any(0.0 <= each.start - when < 1e-3 * BOUND_MS for when in disarmed)
+        and any(each.start - 1e-3 * BOUND_MS < when < each.start + each.amount for when in disarmed)
     ]
 
 

@@ -16,6 +16,7 @@ from benchmarks.fault_campaign.attack import (
     FORGED,
     ON_INSTRUCTIONS,
     ON_MOTORS,
+    ON_PROGRAM,
     ON_REPLIES,
     ON_TIME,
     Attack,
@@ -90,6 +91,16 @@ class Middle(FakeSerial):
         """Undo the attacks' changes to the servos."""
         while self._undo:
             self._undo.pop()()
+
+    def stand_still(self, seconds: float) -> None:
+        """Suspend the program for a duration [s]; meanwhile, other programs may attack the servos."""
+        until = self.clock.now() + seconds
+        for each in [each for each in self._to_come if each.start <= until and each.kind not in ON_PROGRAM]:
+            self._to_come.remove(each)
+            self.clock.wait_until(max(each.start, self.clock.now()))
+            self.bus.advance(self.clock.now())
+            self._undo += happen(each, self)
+        self.clock.wait_until(until)
 
     # What the program calls
 

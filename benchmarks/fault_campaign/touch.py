@@ -5,6 +5,7 @@ import resource
 import signal
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from benchmarks.fault_campaign.attack import ON_MOTORS, Attack, Kind
@@ -54,7 +55,7 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
             port.dead = True
             raise Killed
         case Kind.STALL | Kind.SUSPENDED:
-            port.clock.wait_until(port.clock.now() + attack.amount)
+            port.stand_still(attack.amount)
         case Kind.DISK_FULL:
             return [_fill_disk()]
         case Kind.CLOCK_SET:
@@ -104,9 +105,9 @@ def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
         case Kind.STRANGE_GOAL:
             _write_goal(attack, servo)
         case Kind.MODE_TAKEN if servo.torque_enabled:
-            # Position mode is also the mode before the run, so nothing has to be undone.
             for address, value in ((64, 0), (11, _POSITION_MODE), (64, 1)):
                 servo.write(address, bytes((value,)))
+            return partial(_let_go, servo)
         case Kind.TURNED_ROUND:
             undo = _change(servo, "Drive Mode", servo.value("Drive Mode") ^ 1)
             servo.reboot(now, _SHORT_BOOT_S)  # with torque on, Drive Mode could not be written
@@ -118,6 +119,15 @@ def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
         case _:
             return _reconfigure(attack, servo)
     return None
+
+
+def _let_go(servo: EmulatedServo) -> None:
+    """Switch off the torque of a servo that another program still holds, as that program would when it ends.
+
+    Position mode is also the mode before the run, so it does not have to be undone.
+    """
+    if servo.operating_mode == _POSITION_MODE:
+        servo.write(64, b"\x00")
 
 
 def _reconfigure(attack: Attack, servo: EmulatedServo) -> Undo | None:

@@ -12,6 +12,7 @@ from benchmarks.fault_campaign.attack import Attack, Kind
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.servo.memory import Memory
 from hil.fakes.servo.servo import EmulatedServo
+from hil.fakes.servo.write_rules import WATCHDOG_TRIPPED
 
 STEP_S = 1e-3
 CURRENT_MODE, PWM_MODE = 0, 16
@@ -191,7 +192,8 @@ def _teller(servo: EmulatedServo) -> Callable[[], tuple[bool, bool, int, int]]:
     ID.
     """
     memory = servo.memory
-    torque_at, mode_at, id_at = (memory.registers[name].address for name in ("Torque Enable", "Operating Mode", "ID"))
+    names = "Torque Enable", "Operating Mode", "ID", "Bus Watchdog"
+    torque_at, mode_at, id_at, watchdog_at = (memory.registers[name].address for name in names)
     current_at, pwm_at = (_bytes_of(memory, name) for name in ("Goal Current", "Goal PWM"))
 
     def tell() -> tuple[bool, bool, int, int]:
@@ -202,7 +204,8 @@ def _teller(servo: EmulatedServo) -> Callable[[], tuple[bool, bool, int, int]]:
         elif mode == PWM_MODE:
             goal = int.from_bytes(data[pwm_at], "little", signed=True)
         else:
-            goal = int(torque)  # position and velocity control drive the motor whenever torque is on
+            # Position and velocity control drive the motor whenever torque is on, unless the watchdog has stopped it.
+            goal = int(torque and data[watchdog_at] != WATCHDOG_TRIPPED)
         return torque and goal != 0, torque, goal, data[id_at]
 
     return tell

@@ -95,10 +95,11 @@ def pause_after(delay: float, share: float = _DELAYED_SHARE) -> float:
 class ReadBack:
     """Reads back the goals that the servos hold right before a cycle, and occasionally other registers instead.
 
-    goal: a span of Bus Watchdog and goal. mode: a span that ends with the settings; `modes` holds each servo's values.
-    A change to one of these settings reverses the motor, shifts every angle, or changes the meaning of goals.
-    torque: a span that begins with Torque Enable. watches_torque: whether Torque Enable is read back regularly, which
-    is necessary if no status includes it. interval: time between two cycles [s], 0 if unknown.
+    goal: a span of Bus Watchdog, registers that limit the motor's output, and goal; `limits` holds each servo's values
+    of these registers. mode: a span that ends with the settings; `modes` holds each servo's values. A change to one of
+    them reverses the motor, shifts every angle, or changes the meaning of goals. torque: a span that begins with Torque
+    Enable. watches_torque: whether Torque Enable is read back regularly, which is necessary if no status includes it.
+    interval: time between two cycles [s], 0 if unknown.
 
     If a cycle leaves no time to read all servos, only one is read (`alone`); the servos take turns.
 
@@ -113,6 +114,7 @@ class ReadBack:
         mode: Span | Sequence[Span],
         modes: Sequence[Sequence[int]],
         torque: Span | Sequence[Span],
+        limits: Sequence[Sequence[int]],
         *,
         watches_torque: bool = False,
         interval: float = 0.0,
@@ -127,6 +129,8 @@ class ReadBack:
         self._longest_again = _AGAIN_SHARE * interval if interval <= _SHORT_CYCLE_S else 0.0
         self._repeated_at = -math.inf
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
+        self._names_of_limits = [own.registers[1:-1] for own in one_each(goal, len(ids))]
+        self._limits = tuple(map(tuple, limits))
         self._modes = tuple(map(tuple, modes))
         self._settings = one_each(mode, len(ids))[0].registers[-len(self._modes[0]) :]
         self.kind = MODES
@@ -141,7 +145,7 @@ class ReadBack:
         self._was_of_goals = False
         self._draws = {kind: Random(kind) for kind in (GOALS, MODES, TORQUE)}
         self._goals_sighted: list[_Sightings] = [deque() for _ in ids]
-        self._modes_sighted: list[_Sightings] = [deque() for _ in ids]
+        self._settings_sighted: list[_Sightings] = [deque() for _ in ids]
         self._never_written = [ForeignValues() for _ in ids]
         """Values that this program cannot have written, by servo."""
         self.is_unexpected = False
@@ -246,12 +250,13 @@ class ReadBack:
         if of_modes and not foreign and None not in intact:
             self.modes_seen_at = now
         for place, register, value, written in foreign:
-            seen = (self._modes_sighted if of_modes else self._goals_sighted)[place]
+            of_goal = register == self._goals[place]
+            seen = (self._goals_sighted if of_goal else self._settings_sighted)[place]
             while seen and now - seen[0][0] > _SIGHTED_S:
                 seen.popleft()
             seen.append((now, value))
             self.sighted = Overruled(place, register, value, written)
-            is_ours = not of_modes and (value == 0 or any(value in each for each in sent))
+            is_ours = of_goal and (value == 0 or any(value in each for each in sent))
             if not is_ours:
                 self._never_written[place].add(now)
                 if self._never_written[place].are_proof(now):
@@ -269,8 +274,8 @@ class ReadBack:
     def _are_latest(self, servos: Sequence[Answer], goals: Sequence[int]) -> bool:
         """Return whether all servos hold their latest goals and report no error."""
         watchdogs: list[tuple[int, int]] = []
-        for answer, goal in zip(servos, goals, strict=True):
-            if not answer or answer[0] or answer[-1] != goal:
+        for answer, goal, limits in zip(servos, goals, self._limits, strict=True):
+            if not answer or answer[0] or answer[-1] != goal or answer[2:-1] != limits:
                 return False
             watchdogs.append((len(watchdogs), answer[1]))
         self.watchdogs = watchdogs
@@ -299,7 +304,8 @@ class ReadBack:
             return found
         for place, answer in enumerate(servos):
             self._looks[place] += answer is not None and not collided
-        self.is_unexpected = any(
+        limits = self._other_limits(servos)
+        self.is_unexpected = bool(limits) or any(
             answer is not None and answer[-1] != value for answer, value in zip(servos, sent[-1], strict=True)
         )
         if not self.is_unexpected:
@@ -308,10 +314,20 @@ class ReadBack:
             self._count_missed(servos, sent)
         # A servo that received its neighbour's goal is not commanded by another master.
         own = set().union(*islice(reversed(sent), _RECENT))
-        return [
+        return limits + [
             Overruled(place, self._goals[place], answer[-1], sent[-1][place])
             for place, answer in enumerate(servos)
             if answer is not None and answer[-1] not in own
+        ]
+
+    def _other_limits(self, servos: Sequence[Answer]) -> list[Overruled]:
+        """Return the limits that differ from what this program wrote or found."""
+        return [
+            Overruled(place, *each)
+            for place, (answer, limits) in enumerate(zip(servos, self._limits, strict=True))
+            if answer is not None
+            for each in zip(self._names_of_limits[place], answer[2:-1], limits, strict=True)
+            if each[1] != each[2]
         ]
 
     def _other_settings(self, servos: Sequence[Answer]) -> list[Overruled]:

@@ -11,7 +11,6 @@ from hil.drivers.preparation.settings import arms_itself
 from hil.drivers.preparation.unsuitable import APPLY_HOMING, ignored_homing, unsuitable_drive_mode
 from hil.drivers.servo import NO_ERROR, Servo, describe_error
 from hil.drivers.servo_model import Mode
-from hil.drivers.state import SETTINGS
 
 LISTEN_S = 0.05
 """How long the bus must be quiet before this program starts to use it [s]."""
@@ -95,9 +94,10 @@ def overheard(what: str) -> BusOverheard:
 def overruled(joint: Joint, found: Overruled) -> BusShared:
     """Return the error for a servo that holds a goal or a setting that this program did not write."""
     by, before, check = "is being commanded", f"but {found.written} was written", ""
-    if found.register in SETTINGS and found.register != "Operating Mode":
+    is_goal = found.register == joint.mode.goal_register
+    if not is_goal and found.register != "Operating Mode":
         by, before = "was changed", f"and read {found.written} before the start"
-    if found.register not in SETTINGS:
+    if is_goal:
         check = " If there is none, goals are being altered in transit: check the adapter and the cable."
     return BusShared(
         f"{joint.title[0].upper()}{joint.title[1:]} {by} by another program: its {found.register} reads "

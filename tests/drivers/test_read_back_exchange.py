@@ -21,7 +21,7 @@ ONE_READ_BACK_S = 0.004
 def read_back_of(wire: Wire) -> ReadBackExchange:
     cycles = exchange(wire)
     modes = [Mode.CURRENT, Mode.CURRENT]
-    cycles.add_read_back(*read_back_spans(modes, [XM430, XM430]), [(0, mode, 0) for mode in modes])
+    cycles.add_read_back(*read_back_spans(modes, [XM430, XM430]), [(0, mode, 0) for mode in modes], [(0,), (0,)])
     return cycles
 
 

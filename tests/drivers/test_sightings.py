@@ -15,23 +15,24 @@ MODES = Span.of([XM430] * 2, ("Drive Mode", "Operating Mode"))
 TORQUE = Span.of([XM430] * 2, ("Torque Enable", "Hardware Error Status"))
 OURS, FOREIGN = 40, -7
 MODE, OTHER_MODE = 0, 3
+WATCHDOG, LIMIT = 4, 885
 SENT = [[10, 20], [30, OURS]]
 LONG_AGO = 55
 """A goal older than the recent ones."""
 
 
 def read_back() -> ReadBack:
-    return ReadBack((1, 2), GOALS, MODES, [(MODE,), (MODE,)], TORQUE, fast=False)
+    return ReadBack((1, 2), GOALS, MODES, [(MODE,), (MODE,)], TORQUE, [(LIMIT,)] * 2, fast=False)
 
 
 def reads_modes(back: ReadBack) -> bool:
     return back.read is back.reads[True]
 
 
-def look(back: ReadBack, now: float, *, goal: int = OURS, mode: int = MODE) -> Overruled | None:
-    """Read back once: the second servo holds this goal and mode."""
-    held = (MODE, mode) if reads_modes(back) else (SENT[-1][0], goal)
-    servos: list[Answer] = [(0, each) for each in held]
+def look(back: ReadBack, now: float, *, goal: int = OURS, mode: int = MODE, limit: int = LIMIT) -> Overruled | None:
+    """Read back once: the second servo holds this goal, mode and limit."""
+    goals: list[Answer] = [(0, WATCHDOG, LIMIT, SENT[-1][0]), (0, WATCHDOG, limit, goal)]
+    servos: list[Answer] = [(0, MODE), (0, mode)] if reads_modes(back) else goals
     return back.look(servos, [[LONG_AGO, 56], *SENT * 2], now)
 
 
@@ -49,7 +50,7 @@ def test_the_second_foreign_goal_is_proof_the_third_of_one_that_lost_writes_may_
 @pytest.mark.parametrize("register", ["Drive Mode", "Operating Mode", "Homing Offset"])
 def test_any_setting_that_changes_what_goals_and_angles_mean_is_compared(register: str) -> None:
     names = ("Drive Mode", "Operating Mode", "Homing Offset")
-    spans = GOALS, Span.of([XM430] * 2, ("ID", *names)), [(0, 0, -84), (4, 3, 0)], TORQUE
+    spans = GOALS, Span.of([XM430] * 2, ("ID", *names)), [(0, 0, -84), (4, 3, 0)], TORQUE, [(LIMIT,)] * 2
     back = ReadBack((1, 2), *spans, fast=False)
     held = {name: value + 7 * (name == register) for name, value in zip(names, (4, 3, 0), strict=True)}
     for now, found in ((0.0, False), (0.01, True)):
@@ -85,6 +86,18 @@ def test_the_second_foreign_mode_is_proof() -> None:
         now += 0.01
         found = look(back, now, mode=OTHER_MODE)
     assert seen == 2 and found == Overruled(1, "Operating Mode", OTHER_MODE, MODE)
+
+
+@pytest.mark.parametrize("limit", [0, LIMIT - 1])
+def test_the_second_foreign_limit_is_proof_although_the_goals_are_ours(limit: int) -> None:
+    back = read_back()
+    seen, now, found = 0, 0.0, None
+    while found is None:
+        seen += not reads_modes(back)
+        now += 0.01
+        found = look(back, now, limit=limit)
+    assert seen == 2 and back.is_unexpected
+    assert found == Overruled(1, "Goal PWM", limit, LIMIT)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +163,7 @@ def test_a_refusal_or_a_missing_answer_shows_nothing(error: int) -> None:
 def test_values_with_an_error_are_no_read_back(error: int, shows: bool) -> None:
     back = read_back()
     look(back, 1.0)
-    assert back.look([None, (error, FOREIGN)], SENT, 1.001) is None
+    assert back.look([None, (error, WATCHDOG, LIMIT, FOREIGN)], SENT, 1.001) is None
     assert back.is_unexpected is shows
 
 
@@ -159,7 +172,8 @@ def test_goals_that_a_late_reply_may_have_destroyed_are_not_counted_as_missed(co
     back, now = read_back(), 1.0
     for _ in range(2 * LOST_OF):
         now += 0.01
-        servos: list[Answer] = [(0, MODE)] * 2 if reads_modes(back) else [(0, SENT[-1][0]), (0, SENT[-2][1])]
+        goals: list[Answer] = [(0, WATCHDOG, LIMIT, goal) for goal in (SENT[-1][0], SENT[-2][1])]
+        servos: list[Answer] = [(0, MODE)] * 2 if reads_modes(back) else goals
         assert back.look(servos, SENT, now, collided=collided) is None
     assert (back.lost is None) is collided and back.is_unexpected
 
