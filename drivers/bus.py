@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hil.drivers.control_table import load_control_table, model_names
 from hil.drivers.errors import NoReply, ServoFault, WrongModel, WrongReply
@@ -65,8 +65,12 @@ class BusConfig:
             raise ValueError(f"The servos' IDs are {', '.join(map(str, ids))}, but each must be unique.")
 
     def is_same_arm(self, other: "BusConfig") -> bool:
-        """Return whether both configurations describe the same servos on the same port."""
-        return (self.url, self.baud, self.joints) == (other.url, other.baud, other.joints)
+        """Return whether both configurations describe the same servos on the same port.
+
+        `Joint.near` may differ: it only selects the turn, and a pilot's runs start where the arm has come to rest.
+        """
+        joints, others = ([replace(joint, near=None) for joint in each.joints] for each in (self, other))
+        return (self.url, self.baud, joints) == (other.url, other.baud, others)
 
 
 class ServoBus(TorqueSwitch):

@@ -14,6 +14,8 @@ import pytest
 
 import hil
 from hil.config.schema import Config, load_config, parse_config
+from hil.drivers import bus as drivers_bus
+from hil.drivers.port import Port, open_port
 from hil.dry_run import chain_stop, chain_summary
 from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
@@ -32,6 +34,7 @@ from hil.pilot.chain_shares import PILOT_SHARES, Found, SafeShares, step_config
 from hil.pilot.steps import Say
 from hil.plan.chain_model import known_chain
 from hil.runs.recording import load_samples
+from hil.setup.session.servo_session import servo_session
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
@@ -307,15 +310,23 @@ def test_a_pilot_starts_where_the_arm_lies(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "leg.urdf").write_bytes((CONFIGS / "leg.urdf").read_bytes())
     (tmp_path / "leg.toml").write_text(text.replace("start = [-0.24, 0.0, 0.0]", "start = [-0.24, 0.0, 0.1]"), "utf-8")
     lay: list[list[float]] = []
+    opened: list[object] = []
 
     def of(config: Config, *_: object) -> ChainSearch:
         lay.append(config.arm.rest_pose)
-        raise NoSafeTorque("none")
+        with servo_session(config):
+            raise NoSafeTorque("none")
+
+    def opens(*arguments: Any, **options: Any) -> Port:
+        opened.append(arguments)
+        return open_port(*arguments, **options)
 
     monkeypatch.setattr(ChainSearch, "of", of)
+    monkeypatch.setattr(drivers_bus, "open_port", opens)
     with pytest.raises(NoSafeTorque):
         hil.identify(tmp_path / "leg.toml", out=tmp_path / "run")
     assert lay[0][2] == pytest.approx(0.1, abs=0.06) and lay[0][2] > 0.02
+    assert len(opened) == 1, "a port that locks cannot be opened for each run"
 
 
 def test_a_period_too_short_for_a_path_is_a_mistake_in_the_file() -> None:
