@@ -24,7 +24,7 @@ from hil.fakes.bus.receiver import Receiver
 from hil.fakes.bus.supply import Supply
 from hil.fakes.bus.sync_reads import Reply
 from hil.fakes.bus.wire import Wire
-from hil.fakes.plants.plant import Plant
+from hil.fakes.plants.plant import HasRotors, Plant
 from hil.fakes.servo.present import PRESENT_END, PRESENT_START
 from hil.fakes.servo.servo import EmulatedServo
 
@@ -69,6 +69,7 @@ class FakeBus:
         """Time on `clock` at which the cable was last unplugged [s]."""
         self._servos = tuple(servos)
         self._joints = Joints(servos, plant, joints)
+        self._rotors = plant if isinstance(plant, HasRotors) else None
         self._one_each = self._joints.one_each
         self._supply = supply
         self._wire = Wire(baud, adapter_latency_us * 1e-6)
@@ -258,11 +259,20 @@ class FakeBus:
         state = self.joints()
         if self._supply is not None:
             self._supply.load(self._servos, state[2], now)
-        for servo, position, velocity, current in zip(self._servos, *state, strict=True):
+        for servo, position, velocity, current, turning in zip(
+            self._servos, *state, self._rotor_velocities(state[1]), strict=True
+        ):
             if servo.needs_ticks:
-                servo.tick(TICK_S, position, velocity, current)
+                servo.tick(TICK_S, position, velocity, current, turning)
         if self._hand.busy:
             self._hand.tick(now - self._origin)
+
+    def _rotor_velocities(self, velocities: Sequence[float]) -> Sequence[float]:
+        """Velocities of the rotors, one per servo [rad/s]. velocities: those of the output shafts."""
+        if self._rotors is None:
+            return velocities
+        turning = self._rotors.rotor_velocity
+        return [turning[joint] for joint in self._joints.of]
 
     def _move_plant(self, until: float) -> None:
         self.plant.advance(until - self._origin, self._joints.commands())

@@ -60,6 +60,11 @@ class GearedArm:
         """Rotor angles, referred to the joints [rad]."""
         return [rotor.angle for rotor in self._rotors]
 
+    @property
+    def rotor_velocity(self) -> Sequence[float]:
+        """Rotor velocities, referred to the joints [rad/s]."""
+        return [rotor.velocity for rotor in self._rotors]
+
     def jam(self, joint: int, jammed: bool) -> None:
         self._rotors[joint].motor.jammed = jammed
 
@@ -107,7 +112,7 @@ class _Rotor:
     def __init__(self, drive: Drive, angle: float) -> None:
         self.motor = Motor(drive)
         self.angle = angle
-        self._velocity = 0.0
+        self.velocity = 0.0
         self._inertia = armature(drive)
         self._half_gap = 0.5 * drive.backlash
         self._stiffness = drive.gear_stiffness
@@ -119,18 +124,18 @@ class _Rotor:
         if abs(ahead) <= self._half_gap:
             return 0.0
         depth = ahead - self._half_gap if ahead > 0.0 else ahead + self._half_gap
-        torque = self._stiffness * depth + self._damping * (self._velocity - velocity)
+        torque = self._stiffness * depth + self._damping * (self.velocity - velocity)
         return torque if torque * depth > 0.0 else 0.0
 
     def move(self, step: float, command: float, contact: float) -> None:
-        v = self._velocity
+        v = self.velocity
         push, level, slope, self.motor.current = self.motor.push(step, command, self.angle, v)
         impulse = self._inertia * v + step * (push - contact + slope * v)
         dry = step * level
         left = impulse - dry if impulse > dry else impulse + dry if impulse < -dry else 0.0
-        self._velocity = left / (self._inertia + step * (self.motor.viscous + slope))
-        self.motor.bend(step, 0.5 * (v + self._velocity))
-        self.angle += step * self._velocity
+        self.velocity = left / (self._inertia + step * (self.motor.viscous + slope))
+        self.motor.bend(step, 0.5 * (v + self.velocity))
+        self.angle += step * self.velocity
 
 
 class _Links:

@@ -74,6 +74,16 @@ class CanBeHeld(Protocol):
         ...
 
 
+@runtime_checkable
+class HasRotors(Protocol):
+    """A plant whose rotors do not always move with the output shafts, because its gears have backlash."""
+
+    @property
+    def rotor_velocity(self) -> Sequence[float]:
+        """Velocities of the rotors, referred to the joints [rad/s]; they determine the motors' back-EMF."""
+        ...
+
+
 def make_plant(arm: Arm) -> Plant:
     """Return the plant of this planar arm, at rest in its initial pose at time 0."""
     if any(drive.backlash for drive in arm.drives):

@@ -115,15 +115,18 @@ class Controller:
         if self._goal_before is not None:
             self._goal_before += ticks
 
-    def motor_current(self, model: EmulatedModel, supply_v: float, position_ticks: float, velocity: float) -> float:
+    def motor_current(
+        self, model: EmulatedModel, supply_v: float, position_ticks: float, velocity: float, rotor_velocity: float
+    ) -> float:
         """Run one millisecond of control; return the motor current [A], limited by the supply voltage.
 
-        velocity: velocity of the output shaft in the servo's sense of rotation [rad/s].
+        velocity, rotor_velocity: velocities of the output shaft and of the rotor, referred to the shaft, in the servo's
+        sense of rotation [rad/s].
         """
         goals = self.goals
         if goals is None:
             return 0.0
-        back = model.back_emf_v_s * velocity
+        back = model.back_emf_v_s * rotor_velocity
         limit = min(goals.pwm_limit, abs(goals.pwm))
         if goals.mode == CURRENT_MODE:
             wanted = goals.current * model.current_unit_a

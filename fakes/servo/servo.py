@@ -110,6 +110,8 @@ class EmulatedServo(Powered):
         self.controller = Controller()
         self.motor_current_a = 0.0
         """Commanded motor current, in the joint's direction [A]."""
+        self._applied_share: float | None = None
+        """Duty cycle that the servo's loop applied last; None if the loop does not control the current."""
         self._voltage_limited = voltage_limited
         self._set_baud = baud
         self._registered: bytes | None = None
@@ -198,10 +200,11 @@ class EmulatedServo(Powered):
         self._shut_down_if_masked()
         self._derive()
 
-    def tick(self, step_s: float, position: float, velocity: float, current: float) -> None:
+    def tick(self, step_s: float, position: float, velocity: float, current: float, rotor_velocity: float) -> None:
         """Run one period of the servo's own loop: heating, overload and motor control.
 
-        step_s: period [s]. position, velocity, current: state of the joint [rad, rad/s, A].
+        step_s: period [s]. position, velocity, current: state of the joint [rad, rad/s, A]. rotor_velocity: velocity of
+        the rotor, referred to the joint [rad/s].
         """
         if self.health.changes:
             if self.health.step(step_s, current) and not self.hardware_error & HardwareError.OVERLOAD:
@@ -215,9 +218,10 @@ class EmulatedServo(Powered):
         if self._mode != CURRENT_MODE or self._is_limited:
             ticks = self.present.ticks(position)
             sign = self.present.sign
-            self.motor_current_a = sign * self.controller.motor_current(
-                self.model, self.supply_v, ticks, sign * velocity
-            )
+            turning = sign * rotor_velocity
+            wanted = self.controller.motor_current(self.model, self.supply_v, ticks, sign * velocity, turning)
+            self.motor_current_a = sign * wanted
+            self._applied_share = self._share_of(wanted, turning)
             self.present.tell_trajectory(*self.controller.state(ticks))
 
     # Queries for tests
@@ -453,11 +457,20 @@ class EmulatedServo(Powered):
         # The fast path bypasses the controller, which limits the current by the supply or, in one mode, by the goal.
         by_controller = self._is_limited or self._mode == CURRENT_POSITION_MODE
         self._takes_goal_current = accepts and not by_controller and self._current_limit >= 0
+        if not (moves and (self._mode != CURRENT_MODE or self._is_limited)):
+            self._applied_share = None
         if self.needs_ticks:
             self.controller.goals = Goals.read(self._mode, memory)
         self.changed()
 
     def supply_share(self, current: float, velocity: float = 0.0) -> float:
-        """Return the bridge's duty cycle for this current [A] at this velocity [rad/s], signed, between -1 and 1."""
+        """Return the bridge's duty cycle, signed, between -1 and 1: the one that the servo's loop applied last, or else
+        the one for this current [A] at this velocity [rad/s].
+
+        With backlash, the current flows at the rotor's velocity, which is not that of the output shaft.
+        """
+        return self._share_of(current, velocity) if self._applied_share is None else self._applied_share
+
+    def _share_of(self, current: float, velocity: float) -> float:
         volt = self.model.resistance_ohm * current + self.model.back_emf_v_s * velocity
         return max(-1.0, min(1.0, volt / self.supply_v)) if self._torque and self.supply_v > 0.0 else 0.0

@@ -194,6 +194,30 @@ def test_pwm_control_is_a_voltage() -> None:
     assert rig.read("Present Load") == 0
 
 
+class Rattling(Shaft):
+    """A shaft that moves to and fro in the gap of its gears while the rotor keeps turning."""
+
+    rotor_velocity = (1.5,)
+
+    def advance(self, until: float, current: Any) -> None:
+        self.velocity[0] = 4.0 * (-1) ** round(1e3 * until)
+        self.current[0] = current[0]
+
+
+def test_a_shaft_that_rattles_in_its_gap_changes_neither_current_nor_measured_voltage() -> None:
+    servo = EmulatedServo(load_model("XL430-W250"), 1, registers={"Operating Mode": 16, "Goal PWM": 0})
+    bus = FakeBus([servo], Rattling(), clock := VirtualClock())
+    for register, value in ((64, b"\1"), (100, (300).to_bytes(2, "little"))):
+        bus.write(encode(1, 3, register.to_bytes(2, "little") + value))
+        assert bus.read(11, 0.01)[8] == 0
+    current = (300 / 885 * servo.supply_v - servo.model.back_emf_v_s * 1.5) / servo.model.resistance_ohm
+    for _ in range(20):
+        clock.wait_until(clock.now() + 0.0013)
+        bus.write(encode(1, 2, b"\x7c\x00\x02\x00"))  # Present PWM
+        assert int.from_bytes(bus.read(13, 0.01)[9:11], "little", signed=True) == 300
+        assert servo.motor_current_a == pytest.approx(current)
+
+
 def test_current_based_position_control_is_limited_by_goal_current() -> None:
     rig = Rig(5)
     rig.write("Goal Current", 60)
@@ -354,7 +378,7 @@ def test_where_the_supply_limits_the_current_each_new_goal_counts() -> None:
     servo.write(64, b"\1")
     for ticks in (100, 150, -40):
         servo.write(102, ticks.to_bytes(2, "little", signed=True))
-        servo.tick(1e-3, 0.0, 0.0, 0.0)
+        servo.tick(1e-3, 0.0, 0.0, 0.0, 0.0)
         assert servo.motor_current_a == pytest.approx(ticks * 2.69e-3)
 
 

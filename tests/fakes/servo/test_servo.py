@@ -214,7 +214,7 @@ def test_a_goal_pwm_written_as_in_a_control_cycle_does_what_it_does_in_any_write
         told = []
         for goal in (100, -300, 301, 885, -886, -885, 32767):
             error = write(100, goal.to_bytes(2, "little", signed=True))
-            servo.tick(1e-3, 0.1, 0.2, 0.0)
+            servo.tick(1e-3, 0.1, 0.2, 0.0, 0.2)
             told.append((error, bytes(servo.memory.data), servo.controller.goals, servo.motor_current_a))
         states.append(told)
     assert states[0] == states[1]
