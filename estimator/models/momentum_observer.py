@@ -17,8 +17,9 @@ uncertainty due to parameters and noise, the torque that friction can balance wh
 fraction of the largest planned torque. The noise is estimated as well, so that effects that the model lacks (Stribeck
 friction, backlash, flexibility) widen the admissible range. A deviation that could lead to an alarm is only included in
 this estimate once it has subsided without causing an alarm. Otherwise, if something held a joint for a long time, the
-range would widen until nothing exceeded it. A lower noise level is assumed while a joint stands still, since most noise
-arises only in motion.
+range would widen until nothing exceeded it. For the same reason, the noise is bounded, so that a residual torque larger
+than the largest planned torque always counts: a push that grows slowly would otherwise widen the range ahead of itself.
+A lower noise level is assumed while a joint stands still, since most noise arises only in motion.
 
 Once a joint's angle has stayed within its gear's play for `_STAYS_S`, the reported velocity does not show in which
 direction friction acts: the motor may stick while the link floats from one side of the play to the other. In that case,
@@ -28,7 +29,7 @@ The torque that friction can balance includes the viscous friction at the speeds
 where presliding of the gear softens every reversal, dry friction looks viscous but still holds the joint once it has
 stopped.
 
-While little is known about an arm, its parameters adapt to a disturbance as if it were a property of the arm. Therefore
+While an arm is being learnt, its parameters adapt to a disturbance as if it were a property of the arm. Therefore
 the mean torque over the last few tenths of a second is also compared with an earlier state of the model
 (`earlier_model`).
 
@@ -75,6 +76,7 @@ _VELOCITY_STD = 0.0135  # rad/s: rounding of the register, whose resolution is 0
 _FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned torque
 _NOISE_S = 1.0  # time constant of the noise estimate
 _USUAL_S = 1.0  # time constant of the mean square velocity and of the memory of accelerations
+_MOST_NOISE = 1.0 / (FLOOR_SHARE * TIMES)  # largest noise, relative to the highest floor (see below)
 _CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in variances of the noise
 _STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
 _LESSONS = 2.0  # number of successive updates that share one model error
@@ -100,9 +102,8 @@ _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6,
 # square of the largest recent acceleration; an angle, and for how long the joint has stayed near it.
 _TAUGHT, _TEACHES, _SQUARED, _SHARPEST, _ANGLE, _STAYS = 0, 2, 4, 6, 8, 10
 # The constants: joints, interval, floors; from 4 drifts; then two minimum noises, the highest floors and their
-# friction; whether the arm is hardly known.
+# friction.
 _HIGHEST = 4 + _COUNT + 2
-_HARDLY_KNOWN = _HIGHEST + 3
 
 
 class MomentumObserver:
@@ -114,8 +115,6 @@ class MomentumObserver:
     interval: time between two samples [s].
     frictions: multiple of the dry friction in `mean`; thresholds are derived from this torque if it exceeds `largest`,
     since friction near standstill differs from the model.
-    hardly_known: whether nothing is known of the arm beforehand except the planned torque; if so, mean torques are also
-    compared with the earlier model.
     """
 
     def __init__(
@@ -125,8 +124,6 @@ class MomentumObserver:
         largest: Array,
         interval: float,
         frictions: float = 0.0,
-        *,
-        hardly_known: bool = False,
     ) -> None:
         joints = len(largest)
         if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
@@ -147,7 +144,7 @@ class MomentumObserver:
         drift = _LEAST_DRIFT**2 * np.diag(covariance)
         least_noise = (_FIRST_NOISE_SHARE * 0.1 * highest) ** 2
         friction = [FLOOR_SHARE * frictions]
-        further = (drift, least_noise, highest, friction, [float(hardly_known)])
+        further = (drift, least_noise, highest, friction)
         self._constants = np.concatenate(([joints, interval, *floor], *further))
         self._past = earlier_model.memory(_COUNT)
         self.memory = self._memory, self._rests, self._past, self._constants
@@ -338,8 +335,8 @@ def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
     return bool(single[_HELD + j] >= HOLD_S and enough)
 
 
-def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> None:
-    """Update the noise variance; while an alarm is possible, contributions are deferred."""
+def _teach_noise(m: Any, j: int, taught: float, most: float, dt: float, pending: bool) -> None:
+    """Update the noise variance, up to `most`; while an alarm is possible, contributions are deferred."""
     for_later = m[_PENDING]
     if pending:
         for_later[_TAUGHT + j] += taught * dt
@@ -349,7 +346,8 @@ def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> Non
     if seconds <= 0.0:
         return
     mean = (taught * dt + for_later[_TAUGHT + j]) / seconds
-    m[_SINGLE, _NOISE + j] += min(seconds / _NOISE_S, 1.0) * (mean - m[_SINGLE, _NOISE + j])
+    noise = m[_SINGLE, _NOISE + j] + min(seconds / _NOISE_S, 1.0) * (mean - m[_SINGLE, _NOISE + j])
+    m[_SINGLE, _NOISE + j] = min(noise, most)
     for_later[_TAUGHT + j] = for_later[_TEACHES + j] = 0.0
 
 
@@ -473,12 +471,12 @@ def _observe_loop(
         held = abs(lacking) - _CERTAIN * math.sqrt(left_open)
         if _is_blocked(m, rests[j], j, distance, row, held, quiet * floor, noise, rounding, dt):
             alarm = j
-        if k[_HARDLY_KNOWN] > 0.0:
-            mean = _look_back(m, past, k, j, row, v, stands, static, rounding, dt)
-            if mean != 0.0:
-                single[_LACKING + j], alarm = mean, j
+        mean = _look_back(m, past, k, j, row, v, stands, static, rounding, dt)
+        if mean != 0.0:
+            single[_LACKING + j], alarm = mean, j
         taught = min(beyond * beyond - left_open - rounding, _CLIPPED * single[_NOISE + j])
-        _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), dt * (1.0 - stands), single[_SAMPLES + j] > 0.0)
+        most_noise = (_MOST_NOISE * k[_HIGHEST + j]) ** 2
+        _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), most_noise, dt * (1.0 - stands), single[_SAMPLES + j] > 0.0)
         if lesson and beyond <= TIMES * math.sqrt(spread) and not _is_suspect(rests[j]):
             taught_by = _LESSONS * (spread - left_open) + _STANDING_LESSONS * (1.0 - quiet) * rounding
             first = 0 if _accelerates(m, j, slope) else _INERTIAS

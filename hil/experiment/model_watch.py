@@ -265,7 +265,7 @@ class ModelWatch:
         # A pilot's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         is_described = arms is not None or config.arm.link_lengths is not None
         frictions = _FRICTIONS if is_described else _FRICTIONS_UNDESCRIBED
-        self._observer = MomentumObserver(mean, covariance, largest, interval, frictions, hardly_known=not is_described)
+        self._observer = MomentumObserver(mean, covariance, largest, interval, frictions)
         self._names = [joint.joint.title for joint in config.joints]
         self._blocked_by = [causes_of_standstill(joint.joint) for joint in config.joints]
         self._limits = [joint.position_limit for joint in config.joints]

@@ -43,7 +43,7 @@ class Pace:
         """Number of exchanges per sample."""
         self._apart = self.interval / self.turns
         self._deadline: float | None = None
-        self._takes = 0.0
+        self._takes, self._took = 0.0, inf
         self._awake_at = -inf
         self.sent_at: float | None = None
         """When the latest goals were sent [s]; None before the first ones."""
@@ -69,7 +69,8 @@ class Pace:
     def between(self, goal: Sequence[float]) -> Iterator[State]:
         """Repeat the exchange with the same goals until the next sample is due; yield each state.
 
-        An exchange that might delay the next sample is skipped: the adapter may be slow, or a servo silent.
+        An exchange that might delay the next sample is skipped: the adapter may be slow, or a servo silent. A single
+        long exchange, while this computer was busy, is no reason to skip the next ones.
         """
         if self._deadline is None:
             return
@@ -83,5 +84,6 @@ class Pace:
             if now - due < self._apart and now + self._takes < following:
                 state = self._bus.exchange(goal, between=True)
                 self.sent_at, self._awake_at = state.time_before_write, state.time_after_read
-                self._takes = max(_FORGETS * self._takes, state.time_after_read - state.time_before_write)
+                took = state.time_after_read - state.time_before_write
+                self._takes, self._took = max(_FORGETS * self._takes, min(took, self._took)), took
                 yield state

@@ -1,10 +1,12 @@
 """At slow rates faults are detected as early as at fast ones: the goals are exchanged again between two samples."""
 
+import math
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,8 +16,11 @@ from hil.api.check import check
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import CHECK_S, ServoBus
 from hil.errors import Cause, ConfigError, SafetyStop, StopRequested
+from hil.experiment.guard import Guard
+from hil.experiment.pace import Pace
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress
+from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.bus.faults import Fault, FaultKind
 from hil.plan.plan import make_plan
 from hil.plan.stabiliser import too_slow
@@ -84,6 +89,35 @@ def test_a_slow_adapter_leaves_exchanges_out_and_delays_no_sample(
     samples = run(config, tmp_path / "run", lambda _: None)
     assert np.abs(samples["time_before_write"] - samples["deadline"]).max() < 1e-3
     assert not samples["missing"].any()
+
+
+class SlowOnce:
+    """A bus whose exchanges take the given times [s], and 1 ms once these are used up."""
+
+    exchanges_per_sample = 5
+
+    def __init__(self, takes: list[float]) -> None:
+        self._takes = takes
+        self.port = SimpleNamespace(clock=VirtualClock())
+        self.prepared = SimpleNamespace(read_back_at=math.inf, awaited_until=-math.inf)
+
+    def exchange(self, goal: Sequence[float], *, between: bool = False) -> Any:
+        clock = self.port.clock
+        before = clock.now()
+        clock.wait_until(before + (self._takes.pop(0) if between and self._takes else 1e-3))
+        return SimpleNamespace(time_before_write=before, time_after_read=clock.now())
+
+
+@pytest.mark.parametrize(("takes", "counts"), [([0.001, 0.001, 0.033], [3, 4, 4]), ([0.033] * 3, [1, 1, 1])])
+def test_a_single_long_exchange_does_not_prevent_the_next_ones(takes: list[float], counts: list[int]) -> None:
+    bus = cast("ServoBus", SlowOnce(takes))
+    pace = Pace(bus, RATE, cast("Guard", SimpleNamespace(woke_up=lambda *_: None)))
+    counted = []
+    for _ in counts:
+        pace.wait()
+        pace.send([0.1])
+        counted.append(len(list(pace.between([0.1]))))
+    assert counted == counts
 
 
 @pytest.mark.parametrize(("rate", "count"), [(20.0, 5), (33.0, 3), (60.0, 1), (100.0, 1), (400.0, 1)])
