@@ -63,7 +63,7 @@ RAM = (STATUS_LEVEL, *_GAINS, *_GOALS)
 last, once the mode and the limits that they belong to have been restored.
 """
 
-_BOUNDS = {
+LIMIT_OF_GOAL = {
     "Goal PWM": "PWM Limit",
     "Goal Current": "Current Limit",
     "Goal Velocity": "Velocity Limit",
@@ -108,7 +108,7 @@ def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
     Raises the errors of `Servo.read`.
     """
     cut = dict(settings)
-    for goal, limit in _BOUNDS.items():
+    for goal, limit in LIMIT_OF_GOAL.items():
         if goal in settings and goal in servo.table and limit in servo.table:
             most = settings[limit] if limit in settings else servo.read_despite_error(limit)
             cut[goal] = max(-most, min(settings[goal], most))
@@ -225,7 +225,7 @@ def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | 
     errors of `Servo.read`.
     """
     wanted = attainable(servo, settings)
-    for name in reversed((*EEPROM, *_BOUNDS, "Bus Watchdog")):
+    for name in reversed((*EEPROM, *LIMIT_OF_GOAL, "Bus Watchdog")):
         if name not in wanted or name not in servo.table or servo.read_despite_error(name) == wanted[name]:
             continue
         if (now := servo.read_surely(name)) != wanted[name]:

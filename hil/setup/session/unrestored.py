@@ -6,6 +6,8 @@ from pathlib import Path
 
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
+from hil.drivers.preparation.settings import LIMIT_OF_GOAL
+from hil.drivers.servo import Servo
 from hil.drivers.torque.off import and_list, by_reason
 from hil.setup.changed_settings import Settings
 from hil.setup.session.killed_run import half_let_down, recover
@@ -117,11 +119,12 @@ def _lowered_limits(saved: SavedSettings, settings: Settings, silent: Collection
     """Report which PWM Limits were lowered during the session, and which goals cannot be restored as a result."""
     for joint, servo in saved.bus.drives.items():
         before = settings.get((joint, _PWM_LIMIT))
-        if before is None or joint in silent:
+        if joint in silent or joint not in saved.wanted:
             continue
         with suppress(DriverError):
             now, wanted = servo.read_surely(_PWM_LIMIT), saved.wanted[joint]
-            if now == before:
+            if before is None or now == before:
+                yield from _goals_beyond_limits(saved, joint, servo)
                 continue
             reduced = [
                 f"{name} is {value}, not {wanted[name]}"
@@ -134,6 +137,18 @@ def _lowered_limits(saved: SavedSettings, settings: Settings, silent: Collection
                 f"{joint.title}: {_PWM_LIMIT} was changed during this command from {before} to {now}, by another "
                 f"program or a factory reset, and is left as it is{': ' if reduced else ''}{', '.join(reduced)}. "
                 f"To change it back, use DYNAMIXEL Wizard 2.0{later}."
+            )
+
+
+def _goals_beyond_limits(saved: SavedSettings, joint: Joint, servo: Servo) -> Iterator[str]:
+    """Report goals that cannot be restored because another program lowered their limits before these were read."""
+    for name, value in saved.reduced.get(joint, {}).items():
+        if name in LIMIT_OF_GOAL and joint not in saved.left:
+            yield (
+                f"{joint.title}: {name} is {value}, not {saved.wanted[joint][name]} as at the start, because its "
+                f"{LIMIT_OF_GOAL[name]} is {servo.read_surely(LIMIT_OF_GOAL[name])}. Another program may have lowered "
+                "this limit while the servos were being set up. To raise it, use DYNAMIXEL Wizard 2.0; the next start "
+                "on this port then restores the goal."
             )
 
 

@@ -47,7 +47,9 @@ def test_settings_that_another_program_changed_are_the_cause_that_is_named(
     assert_stopped(ports[0])
 
 
-@pytest.mark.parametrize(("register", "value"), [("Drive Mode", 1), ("Homing Offset", 40)])
+@pytest.mark.parametrize(
+    ("register", "value"), [("Drive Mode", 1), ("Homing Offset", 40), ("Goal PWM", 266), ("Goal PWM", 0)]
+)
 def test_a_setting_that_hardly_shows_in_the_motion_is_read_back(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
 ) -> None:
@@ -58,6 +60,7 @@ def test_a_setting_that_hardly_shows_in_the_motion_is_read_back(
     with pytest.raises(BusShared, match=rf"'elbow'.* was changed by another program: its {register} reads {value}, "):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, begun, plan)
     assert_stopped(ports[0])
+    assert ports[0].bus.servos[2].value("Goal PWM") == 885
 
 
 @pytest.mark.parametrize(("register", "value"), [("PWM Limit", 5), ("Current Limit", 20)])
@@ -79,9 +82,7 @@ def test_a_limit_that_another_program_lowered_is_the_cause_that_is_named(
     assert_stopped(ports[0])
 
 
-@pytest.mark.parametrize(
-    ("register", "value"), [("PWM Limit", 700), ("Current Limit", 250), ("Goal PWM", 266), ("Goal PWM", 0)]
-)
+@pytest.mark.parametrize(("register", "value"), [("PWM Limit", 700), ("Current Limit", 250)])
 def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
 ) -> None:
@@ -94,7 +95,7 @@ def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
     run = RunFolder.create(tmp_path / "run", config)
     if register != "PWM Limit":
         said = run_experiment(config, run, config.path, lower, plan)
-        assert ports[0].bus.servos[2].value(register) == {"Current Limit": 1193, "Goal PWM": 885}[register]
+        assert ports[0].bus.servos[2].value(register) == 1193
     else:
         with pytest.raises(ExperimentError, match="PWM Limit was changed during this command from 885 to 700") as stop:
             run_experiment(config, run, config.path, lower, plan)

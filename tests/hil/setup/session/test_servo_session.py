@@ -21,6 +21,7 @@ from hil.errors import Cause, ExperimentError, HilError, SafetyStop, StopRequest
 from hil.fakes.bus.faults import Fault
 from hil.setup.finding import Finding, Level
 from hil.setup.preflight import check_arm
+from hil.setup.session import servo_session as servo_session_module
 from hil.setup.session.end_of_session import about_torque
 from hil.setup.session.saved_settings import SavedSettings
 from hil.setup.session.servo_session import COUNT_DOWN_S, ServoSession, servo_session
@@ -180,6 +181,35 @@ def test_a_pwm_limit_that_another_program_lowered_is_named_and_goals_are_restore
         pass
     assert list(state_folder.glob("*.json")) == [], "the next start tries once more, whether or not it is possible"
     assert bench.servos[2].value("Goal PWM") == (885 if is_undone else limit)
+
+
+@pytest.mark.parametrize(
+    ("address", "goal", "limit", "before"),
+    [(36, "Goal PWM", "PWM Limit", 885), (38, "Goal Current", "Current Limit", 1193)],
+)
+def test_a_goal_that_a_limit_lowered_during_set_up_cuts_is_named(
+    arm: Arm,
+    bench: Bench,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    address: int,
+    goal: str,
+    limit: str,
+    before: int,
+) -> None:
+    """This program reads the limit only after another program has lowered it."""
+    read = servo_session_module.read_settings
+
+    def lowered(servo: Servo) -> dict[str, int]:
+        settings = read(servo)
+        if servo.id == 2:
+            bench.servos[2].write(address, (60).to_bytes(2, "little"))
+        return settings | ({limit: 60} if limit in settings and servo.id == 2 else {})
+
+    monkeypatch.setattr(servo_session_module, "read_settings", lowered)
+    said = rf"Joint 'elbow'.*: {goal} is 60, not {before} as at the start, because its {limit} is 60\. Another program"
+    with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
+        pass
 
 
 @pytest.mark.parametrize("kind", ["silent_servo", "reboot", "overheating", "cable_pulled"])
