@@ -34,6 +34,8 @@ _REGISTERS = (
     *PROTECTIVE,
 )
 
+_LIMITS = frozenset({"PWM Limit", "Current Limit", _GOAL_PWM})
+
 WRITTEN = frozenset({"Operating Mode", "Current Limit", _GOAL_PWM})
 """Settings that this program writes itself."""
 
@@ -118,12 +120,12 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
     cause: why the run was stopped. Settings that cannot explain this are omitted, except for those in `_BESIDE`.
     """
     differing = {each: value for each, value in before.items() if after.get(each, value) != value}
-    if not any(_may_explain(each[1], cause, after[each]) for each in differing):
+    if not any(_may_explain(each[1], cause, value, after[each]) for each, value in differing.items()):
         return ""
     changed = [
         f"{joint}: {register} from {_told(register, value)} to {_told(register, after[joint, register])}"
         for (joint, register), value in differing.items()
-        if register in _BESIDE or _may_explain(register, cause, after[joint, register])
+        if register in _BESIDE or _may_explain(register, cause, value, after[joint, register])
     ]
     said = f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."
     if (swapped := _swapped(before, after)) is not None:
@@ -165,12 +167,14 @@ def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago
     return f"{changed_settings(before, after)} This may have happened after the stop: {last}."
 
 
-def _may_explain(register: str, cause: Cause | None, now: int) -> bool:
-    """Whether a change to `now`, the register's present value, may explain why the run was stopped."""
+def _may_explain(register: str, cause: Cause | None, before: int, now: int) -> bool:
+    """Whether a change of a register from `before` to `now` may explain why the run was stopped."""
     if register == STATUS_LEVEL and now == 0:
         return cause in (None, Cause.MISSING)
     if cause is None or register in _BESIDE:
         return cause is None
+    if register in _LIMITS and now > before:
+        return False  # this program's goals are below the former limit
     return cause in (_LATE if register == _DELAY else _MOVED)
 
 

@@ -43,6 +43,14 @@ def test_a_protection_is_named_beside_the_cause_of_a_stop_but_is_none() -> None:
     )
 
 
+@pytest.mark.parametrize("register", ["PWM Limit", LIMIT, "Goal PWM"])
+def test_a_raised_limit_stops_nothing(register: str) -> None:
+    before, after = {(ELBOW, register): 400}, {(ELBOW, register): 800}
+    assert changed_settings(before, after, Cause.JUMP) == ""
+    assert f"{register} from 400 to 800" in changed_settings(before, after), "it is named beside the cause"
+    assert f"{register} from 800 to 400" in changed_settings(after, before, Cause.JUMP)
+
+
 class Late:
     """A servo whose replies are `late` requests old."""
 
