@@ -103,7 +103,7 @@ def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
         case Kind.WATCHDOG_TRIPPED if servo.torque_enabled:
             servo.trip_watchdog()
         case Kind.STRANGE_GOAL:
-            _write_goal(attack, servo)
+            return _leave_goal(attack, servo)
         case Kind.MODE_TAKEN if servo.torque_enabled:
             for address, value in ((64, 0), (11, _POSITION_MODE), (64, 1)):
                 servo.write(address, bytes((value,)))
@@ -119,6 +119,16 @@ def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
         case _:
             return _reconfigure(attack, servo)
     return None
+
+
+def _leave_goal(attack: Attack, servo: EmulatedServo) -> Undo | None:
+    """Write a goal once. If torque is already off, the program may have ended with this servo, so it is not blamed if
+    the goal remains.
+    """
+    is_off, name = not servo.torque_enabled, "Goal Current" if servo.operating_mode == 0 else "Goal PWM"
+    before = servo.value(name) if name in servo.memory else 0
+    _write_goal(attack, servo)
+    return _change(servo, name, servo.value(name), before) if is_off and name in servo.memory else None
 
 
 def _let_go(servo: EmulatedServo) -> None:
