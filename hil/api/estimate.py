@@ -12,9 +12,11 @@ from hil.api.experiment import unused_path, write_run_report
 from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Estimation, Identification, Run, estimation, identification
 from hil.errors import RecordingCutShort
+from hil.estimation.after_a_stop import after_a_failed_estimate
 from hil.estimation.settled_estimate import estimate_run
 from hil.estimation.unsettled.estimate import estimate_unsettled
 from hil.estimation.unsettled.recordings import estimate_recordings
+from hil.estimator.errors import EstimationError
 from hil.recordings.files import is_recording
 from hil.report.recording_page import write_recording_report
 from hil.runs.recording_folder import create, is_recording_folder, load_record
@@ -77,8 +79,9 @@ def estimate(
     tell(Progress("estimation", "Estimating"))
     try:
         result = estimate_run(run, executor)
-    except RecordingCutShort as error:
-        error.add_note(f"To estimate without a settled period: hil estimate {run.path} --all-samples")
+    except (RecordingCutShort, EstimationError) as error:
+        for line in after_a_failed_estimate(run):
+            error.add_note(line)
         raise
     write_run_report(run)
     return identification(result, run.path)

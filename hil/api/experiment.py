@@ -17,8 +17,9 @@ from hil.drivers.errors import DriverError
 from hil.drivers.torque.held import HALF_DOWN
 from hil.dry_run.ensemble import earlier_result
 from hil.errors import ConfigError, ExperimentError, RunFolderError, SafetyStop, StopRequested
-from hil.estimation.after_a_stop import after_a_failure, after_a_stop
+from hil.estimation.after_a_stop import after_a_failed_estimate, after_a_failure, after_a_stop, can_be_estimated
 from hil.estimation.settled_estimate import estimate_run
+from hil.estimator.errors import EstimationError
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress as StreamProgress
 from hil.next_step import next_step
@@ -145,8 +146,10 @@ def _tell_doubts(config: Config, tell: OnProgress) -> None:
 def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: Path) -> list[str]:
     if isinstance(stopped, KeyboardInterrupt | StopRequested | RunFolderError):
         said = after_a_stop(run, command, shown)
+    elif isinstance(stopped, EstimationError) and can_be_estimated(run.path):
+        said = after_a_failed_estimate(run)
     else:
-        failed = isinstance(stopped, DriverError) or getattr(stopped, "exit_code", 0) == 1
+        failed = isinstance(stopped, DriverError | EstimationError) or getattr(stopped, "exit_code", 0) == 1
         said = after_a_failure(run, shown) if failed else []
     if said and _is_unsettled(stopped):
         said[-1] = next_step("check", shown)

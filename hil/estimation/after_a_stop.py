@@ -1,4 +1,4 @@
-"""What remains of a stopped run, and the command with which to continue."""
+"""What remains of a run that was stopped or yielded no result, and the command with which to continue."""
 
 from pathlib import Path
 
@@ -41,6 +41,19 @@ def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
     if can_be_estimated(run.path):
         return ["The recording has been kept and is complete enough for an estimate.", next_step("estimate", run.path)]
     return [f"The recording up to that point is kept in {run.path}.", next_step("check", shown)]
+
+
+def after_a_failed_estimate(run: RunFolder) -> list[str]:
+    """Sentences about a recording with a settled period from which no parameters could be estimated, and the next
+    command.
+    """
+    kept = f"The recording is kept in {run.path}."
+    if run.load_config().is_chain:
+        return [kept, next_step("check", run.load_facts().config)]
+    return [
+        f"{kept} An estimate from all of its samples needs no settled period.",
+        next_step("estimate", run.path, "--all-samples"),
+    ]
 
 
 def _nothing_recorded(run: RunFolder, shown: Path) -> list[str]:

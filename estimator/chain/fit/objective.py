@@ -6,6 +6,7 @@ position is predicted from past measurements and the model (the prediction error
 much as an open-loop simulation.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -121,9 +122,14 @@ class ChainProblem:
         return np.ascontiguousarray(of_steps)
 
     def gain(self, period: SettledPeriod) -> Array:
-        """Return the critically damped observer's gains per sample (2, joints) [1, 1/s]."""
-        turn = 2.0 * np.pi * self.softness
-        gains = np.array([2.0 * turn, turn * turn]) * self.every / period.rate
+        """Return the observer's gains per sample (2, joints) [1, 1/s].
+
+        They make an error of the state decay as with the critically damped observer in continuous time, at every
+        sampling rate.
+        """
+        interval = self.every / period.rate
+        kept = math.exp(-2.0 * math.pi * self.softness * interval)
+        gains = np.array([1.0 - kept**2, (1.0 - kept) ** 2 / interval])
         return np.repeat(gains[:, None], period.joints, axis=1)
 
     def evaluate(self, x: Array) -> Quadratic:

@@ -5,8 +5,9 @@ accelerations. The residual torque, `torque - Y(q, v, a) theta`, is compared wit
 parameters' covariance, rounding of the velocities, and noise that is estimated while the arm moves. The parameters are
 updated as well (a Kalman filter for slowly drifting constants), so the tolerance narrows over time. As in
 `hil.estimator.models.momentum_observer`, which planar arms use, the friction that can hold a joint at rest is
-subtracted from the residual. An alarm is raised if the remainder exceeds `TIMES` standard deviations and a fraction of
-the largest planned torque for `HOLD_S`; large residuals raise it sooner.
+subtracted from the residual. After a reversal, so is the friction that may still act in the former direction, because
+friction in gears reverses only gradually, over some milliradians. An alarm is raised if the remainder exceeds `TIMES`
+standard deviations and a fraction of the largest planned torque for `HOLD_S`; large residuals raise it sooner.
 
 The noise estimate is updated only during motion: the residual of a joint at rest would widen the tolerance until
 nothing exceeded it. A joint at rest is also assessed by the range of torques on it (`hil.estimator.models.standstill`).
@@ -35,6 +36,7 @@ FLOOR_SHARE = 0.25
 FIRST_NOISE_SHARE = 0.1
 STANDING = 0.05  # rad/s: below this, dry friction may hold a joint
 STATIC = 1.5  # ratio of static to Coulomb friction
+YIELDS_RAD = 0.005  # rad: distance within which friction may approach its new value after a reversal (Dahl's model)
 MOSTLY = 0.5  # filtered indicator of standstill above which a joint counts as standing still
 STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
 VISIBLE_RAD_S = 0.027  # smallest velocity that certainly shows in the velocity register
@@ -48,9 +50,10 @@ WARM_S = 3 * FILTER_S
 LONGEST_GAP = 3.0
 # Rows of the observer's memory. Per joint: filtered angle, velocity and torque, acceleration, noise variance, filtered
 # indicator of standstill (0 to 1), time and number of samples above the limit, residual torque, contribution of a
-# possible alarm to the noise estimate and its duration. The last row applies to the whole arm: time since the last
-# update of the parameters, time since the start.
-ANGLE, VELOCITY, TORQUE, SLOPE, NOISE, STANDS, HELD, SAMPLES, LACKING, TAUGHT, TEACHES, TIMES_OF_ALL = range(12)
+# possible alarm to the noise estimate and its duration, dry friction if it reverses gradually, relative to its value
+# during motion (-1 to 1). The last row applies to the whole arm: time since the last update of the parameters, time
+# since the start.
+ANGLE, VELOCITY, TORQUE, SLOPE, NOISE, STANDS, HELD, SAMPLES, LACKING, TAUGHT, TEACHES, BENT, TIMES_OF_ALL = range(13)
 
 
 class ChainObserver:
@@ -167,7 +170,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         for j in range(n):
             memory[ANGLE, j], memory[VELOCITY, j], memory[TORQUE, j] = q[j], v[j], torque[j]
             memory[SLOPE, j] = memory[HELD, j] = memory[SAMPLES, j] = 0.0
-            memory[TAUGHT, j] = memory[TEACHES, j] = 0.0
+            memory[TAUGHT, j] = memory[TEACHES, j] = memory[BENT, j] = 0.0
             _forget(rests[j])
             memory[STANDS, j] = 1.0
         memory[TIMES_OF_ALL, 0] = memory[TIMES_OF_ALL, 1] = 0.0
@@ -181,6 +184,8 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         memory[TORQUE, j] += fallen * (torque[j] - memory[TORQUE, j])
         standing = 1.0 - abs(math.tanh(v[j] / STANDING))
         memory[STANDS, j] += fallen * (standing - memory[STANDS, j])
+        way = memory[VELOCITY, j] * dt
+        memory[BENT, j] += (1.0 - math.exp(-abs(way) / YIELDS_RAD)) * (math.copysign(1.0, way) - memory[BENT, j])
     memory[TIMES_OF_ALL, 0] += dt
     memory[TIMES_OF_ALL, 1] += dt
     supported = 0
@@ -214,7 +219,8 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         for i in range(count):
             row[i] = Y[j, i] if i < base else 0.0
         row[base + j] = memory[VELOCITY, j]
-        row[base + n + j] = math.tanh(memory[VELOCITY, j] / STANDING)
+        bend = math.tanh(memory[VELOCITY, j] / STANDING)
+        row[base + n + j] = bend
         row[base + 2 * n + j] = 1.0
         lacking, left_open = memory[TORQUE, j], 0.0
         for i in range(count):
@@ -231,7 +237,8 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         floor = max(floors[0, j], min(floors[1, j], of_friction * learnt))
         static = max(STATIC * dry, _withstood(rests[j]))
         stands = min(max(memory[STANDS, j], 0.0), 1.0)
-        holds = static * stands
+        late = dry * (memory[BENT, j] - bend)  # friction that still acts in the former direction
+        holds = max(static * stands, abs(late) if late * lacking > 0.0 else 0.0)
         # Error of the acceleration due to the velocity's rounding, times the joint's own inertia.
         inertia = 0.0
         if memory[SLOPE, j] != 0.0:

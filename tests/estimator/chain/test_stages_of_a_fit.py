@@ -15,6 +15,7 @@ from hil.estimator.chain.fit.stage1 import fit_lines
 from hil.estimator.chain.fit.stage2 import ChainFit
 from hil.estimator.chain.fit.starts import REPEATED
 from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.dynamics import inverse_dynamics
 from hil.estimator.chain.simulation.sensitivity import Simulation
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic
@@ -90,6 +91,34 @@ def test_problems_that_differ_in_weights_share_one_simulation(
         changed = replace(problem, **other)
         problem.evaluate(x)
         assert changed.cost(x) == pytest.approx(fresh(changed).cost(x), rel=1e-12), other
+
+
+@pytest.mark.parametrize("rate", [10.0, 20.0, 50.0, 400.0])
+@pytest.mark.parametrize("softness", DEFAULTS.softness)
+def test_the_observer_forgets_an_error_equally_fast_at_every_rate(
+    setup: bench.Setup, rate: float, softness: float
+) -> None:
+    """At 20 Hz, gains proportional to the sampling interval made the stiffest observer's error grow."""
+    period = replace(sticking(1), rate=rate)
+    problem = replace(problem_of(setup, period)[0], softness=softness)
+    for every in (1, 2):
+        gain = replace(problem, every=every).gain(period)
+        corrected = np.array([[1.0 - gain[0, 0], 0.0], [-gain[1, 0], 1.0]])
+        per_sample = np.array([[1.0, every / rate], [0.0, 1.0]]) @ corrected
+        kept = np.exp(-2.0 * np.pi * softness * every / rate)
+        np.testing.assert_allclose(np.linalg.eigvals(per_sample), [kept, kept], atol=1e-6)
+
+
+@pytest.mark.parametrize("softness", DEFAULTS.softness)
+def test_a_slowly_sampled_motion_is_followed(setup: bench.Setup, softness: float) -> None:
+    """At 20 Hz, without which no fit can start."""
+    path = bench.path_of(bench.BENCHES[4], setup, 101)
+    torque = inverse_dynamics(setup.base.chain, setup.described, path.position, path.velocity, path.acceleration)
+    period = SettledPeriod(20.0, torque[:, 10::20], path.position[:, ::20], 0.0, np.full(4, bench.TICK))
+    problem, x = problem_of(setup, period)
+    positions = replace(problem, softness=softness).positions(starts.towards_prior(problem, x, DEFAULTS))
+    assert positions is not None
+    assert np.abs(positions[0] - period.position).max() < 0.5
 
 
 def test_repeated_readings_count_as_a_few(setup: bench.Setup) -> None:

@@ -14,9 +14,10 @@ from hil.api.progress import OnProgress, Progress, forgiving
 from hil.drivers.errors import BusShared
 from hil.errors import Cause, ExperimentError, RunFolderError, SafetyStop, StopRequested
 from hil.estimation import after_a_stop
-from hil.estimator.errors import RecordingError
+from hil.estimator.errors import ConvergenceError, RecordingError
 from hil.plan.plan import IDENTIFY
 from hil.runs.background import Background
+from hil.runs.run_folder import RunFolder
 from tests.support.paths import CONFIGS
 
 
@@ -152,6 +153,21 @@ def test_servos_that_are_not_as_before_are_checked_next(
     stopped.add_note(note)
     run: Any = None
     assert experiment._how_to_go_on(stopped, run, "record", Path("a.toml"))[-1] == f"Next: hil {command} a.toml"
+
+
+@pytest.mark.parametrize(
+    ("is_chain", "command"), [(False, "hil estimate run --all-samples"), (True, "hil check arm.toml")]
+)
+def test_a_recording_without_a_result_ends_with_a_command(
+    monkeypatch: pytest.MonkeyPatch, is_chain: bool, command: str
+) -> None:
+    """Only planar arms can be estimated from all samples."""
+    run = RunFolder(Path("run"))
+    monkeypatch.setattr(RunFolder, "load_config", lambda _: SimpleNamespace(is_chain=is_chain))
+    monkeypatch.setattr(RunFolder, "load_facts", lambda _: SimpleNamespace(config="arm.toml"))
+    monkeypatch.setattr(experiment, "can_be_estimated", lambda _: True)
+    said = experiment._how_to_go_on(ConvergenceError("No minimum was found."), run, "identify", Path("arm.toml"))
+    assert said[0].startswith("The recording is kept in run.") and said[-1] == f"Next: {command}"
 
 
 def test_after_a_motion_that_contradicts_the_description_the_joints_are_moved_by_hand(

@@ -1,4 +1,4 @@
-"""What the observer of a spatial arm learns, and must not learn, from a joint at standstill."""
+"""What a spatial arm's observer learns, and must not learn, from a joint at standstill or just after a reversal."""
 
 import numpy as np
 import pytest
@@ -106,3 +106,31 @@ def test_friction_that_a_joint_has_overcome_before_is_no_alarm_the_next_time() -
         angle = swings(looks, 1.6, angle)
     for slope in (0.5, 0.1):
         assert alarm_after(looks, angle, slope, 0.36 / slope) == np.inf
+
+
+def slow_swings(looks: ChainObserver, samples: int, lacking: float = 0.0, since: int = 0) -> int:
+    """Swing the joint of `observer(DRY)`, whose friction reverses gradually; return the sample of an alarm, or -1.
+
+    lacking: torque [N m] that the motion does not reflect, in the direction of motion, from the sample `since` on.
+    """
+    angle, bristle = 0.0, 0.0
+    for k in range(samples):
+        velocity, acceleration = 0.4 * np.sin(4.0 * k * INTERVAL), 1.6 * np.cos(4.0 * k * INTERVAL)
+        angle += velocity * INTERVAL
+        bristle += (1.0 - np.exp(-abs(velocity) * INTERVAL / 0.008)) * (np.sign(velocity) - bristle)
+        torque = 0.01 * acceleration + 0.03 * velocity + DRY * bristle
+        torque += lacking * np.sign(velocity) * (k >= since)
+        if looks.observe([angle], [velocity], [torque], INTERVAL, True) == 0:
+            return k
+    return -1
+
+
+def test_friction_that_reverses_gradually_is_no_alarm() -> None:
+    assert slow_swings(observer(DRY)[0], 4000) == -1
+
+
+@pytest.mark.parametrize("lacking", [0.5, -0.5])
+def test_but_a_torque_that_is_lacking_after_a_reversal_is(lacking: float) -> None:
+    reversal = round(np.pi / 4.0 / INTERVAL) * 4
+    found = slow_swings(observer(DRY)[0], reversal + 400, lacking, reversal)
+    assert 0 <= found - reversal <= 0.1 / INTERVAL
