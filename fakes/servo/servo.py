@@ -221,7 +221,7 @@ class EmulatedServo(Powered):
             turning = sign * rotor_velocity
             wanted = self.controller.motor_current(self.model, self.supply_v, ticks, sign * velocity, turning)
             self.motor_current_a = sign * wanted
-            self._applied_share = self._share_of(wanted, turning)
+            self._applied_share = self.supply_share(wanted, turning)
             self.present.tell_trajectory(*self.controller.state(ticks))
 
     # Queries for tests
@@ -390,7 +390,7 @@ class EmulatedServo(Powered):
 
     def _operating_mode_written(self) -> None:
         self._forget_turns_in_position_mode()
-        self.present.derive(self.supply_share)  # the mode determines whether Homing Offset applies
+        self.present.derive(self.applied_share)  # the mode determines whether Homing Offset applies
         self._reset_goals()
         for name in (*GAINS, *PROFILE):
             if name in self.memory:
@@ -429,7 +429,7 @@ class EmulatedServo(Powered):
         self.watchdog_s = watchdog * WATCHDOG_UNIT_S if counting else 0.0
         """Duration of silence after which the watchdog trips [s]; 0 while the watchdog is inactive."""
 
-        self.present.derive(self.supply_share)
+        self.present.derive(self.applied_share)
         self._mode = self.operating_mode if self.model.operating_modes else -1
         self._driven = self._torque and self._mode == CURRENT_MODE
         self._current_per_tick = self.present.sign * self.model.current_unit_a
@@ -463,14 +463,15 @@ class EmulatedServo(Powered):
             self.controller.goals = Goals.read(self._mode, memory)
         self.changed()
 
-    def supply_share(self, current: float, velocity: float = 0.0) -> float:
+    def applied_share(self, current: float, velocity: float) -> float:
         """Return the bridge's duty cycle, signed, between -1 and 1: the one that the servo's loop applied last, or else
         the one for this current [A] at this velocity [rad/s].
 
         With backlash, the current flows at the rotor's velocity, which is not that of the output shaft.
         """
-        return self._share_of(current, velocity) if self._applied_share is None else self._applied_share
+        return self.supply_share(current, velocity) if self._applied_share is None else self._applied_share
 
-    def _share_of(self, current: float, velocity: float) -> float:
+    def supply_share(self, current: float, velocity: float = 0.0) -> float:
+        """Return the bridge's duty cycle for this current [A] at this velocity [rad/s], signed, between -1 and 1."""
         volt = self.model.resistance_ohm * current + self.model.back_emf_v_s * velocity
         return max(-1.0, min(1.0, volt / self.supply_v)) if self._torque and self.supply_v > 0.0 else 0.0

@@ -10,8 +10,9 @@ friction in gears reverses only gradually, over some milliradians. An alarm is r
 standard deviations and a fraction of the largest planned torque for `HOLD_S`; large residuals raise it sooner.
 
 The noise estimate is updated only during motion: the residual of a joint at rest would widen the tolerance until
-nothing exceeded it. A joint at rest is also assessed by the range of torques on it (`hil.estimator.models.standstill`).
-A residual that could lead to an alarm enters the noise estimate only once it has subsided without an alarm.
+nothing exceeded it. It is bounded, so that a residual larger than the largest planned torque always counts. A joint at
+rest is also assessed by the range of torques on it (`hil.estimator.models.standstill`). A residual that could lead to
+an alarm enters the noise estimate only once it has subsided without an alarm.
 """
 
 import math
@@ -272,7 +273,8 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
             if _blocked(rests[j], distance, held, static, tolerance, momentum, FILTER_S, dt):
                 alarm = j
         taught = min(beyond * beyond, CLIPPED * spread) - left_open - rounding
-        _teach_noise(memory, j, max(taught, least_noise[j]), dt * (1.0 - stands))
+        most_noise = (floors[1, j] / (FLOOR_SHARE * TIMES)) ** 2
+        _teach_noise(memory, j, max(taught, least_noise[j]), most_noise, dt * (1.0 - stands))
         # Static friction balances any torque within its bounds while a joint stands still, so nothing can be learnt
         # then.
         if lesson and beyond <= limit and memory[STANDS, j] < MOSTLY and not _is_suspect(rests[j]):
@@ -284,14 +286,17 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
     return alarm
 
 
-def _teach_noise_of(memory: Any, j: int, taught: float, dt: float) -> None:
-    """Update the noise variance; the contribution of a possible alarm is held back until the alarm has ended."""
+def _teach_noise_of(memory: Any, j: int, taught: float, most: float, dt: float) -> None:
+    """Update the noise variance, up to `most`; the contribution of a possible alarm is held back until the alarm has
+    ended.
+    """
     memory[TAUGHT, j] += taught * dt
     memory[TEACHES, j] += dt
     if memory[SAMPLES, j] > 0.0 or memory[TEACHES, j] <= 0.0:
         return
     mean = memory[TAUGHT, j] / memory[TEACHES, j]
-    memory[NOISE, j] += min(memory[TEACHES, j] / NOISE_S, 1.0) * (mean - memory[NOISE, j])
+    noise = memory[NOISE, j] + min(memory[TEACHES, j] / NOISE_S, 1.0) * (mean - memory[NOISE, j])
+    memory[NOISE, j] = min(noise, most)
     memory[TAUGHT, j] = memory[TEACHES, j] = 0.0
 
 
