@@ -13,7 +13,7 @@ from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Identification, Run, identification, load_run
 from hil.clearance.doubts import doubts
 from hil.config.schema import Config
-from hil.drivers.errors import DriverError
+from hil.drivers.errors import DriverError, TorqueNotOff
 from hil.drivers.torque.held import HALF_DOWN
 from hil.dry_run.ensemble import earlier_result
 from hil.errors import ConfigError, ExperimentError, RunFolderError, SafetyStop, StopRequested
@@ -184,8 +184,9 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
                     stopped.add_note(line)
         elif any(HALF_DOWN in note for note in getattr(stopped, "__notes__", [])):
             stopped.add_note(next_step(command, shown, "--take-over"))
-        elif hasattr(stopped, "__notes__") and (
-            isinstance(stopped, DriverError | ExperimentError) or _is_unsettled(stopped)
+        elif isinstance(stopped, TorqueNotOff) or (
+            hasattr(stopped, "__notes__")
+            and (isinstance(stopped, DriverError | ExperimentError) or _is_unsettled(stopped))
         ):
             stopped.add_note(next_step("check", shown))
         raise

@@ -28,6 +28,10 @@ one reply, but different replies corrupt each other.
 """
 
 
+TORQUE_ON = "torque on"
+"""What is said of a servo whose torque is on, among other troubles."""
+
+
 class Found(NamedTuple):
     """One servo that answered.
 
@@ -186,6 +190,6 @@ def _with_state(port: Port, found: Found) -> Found:
 
 def _torque_troubles(servo: Servo) -> Iterator[str]:
     if servo.read("Torque Enable"):
-        yield "torque on"
+        yield TORQUE_ON
     if "Bus Watchdog" in servo.table and servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
         yield "watchdog tripped"

@@ -9,10 +9,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from hil.config.schema import config_of
+from hil.drivers.torque.off import and_list
 from hil.next_step import NEXT, next_step
 from hil.printing import print_fitting, result_console, say, say_behind
 from hil.setup.finding import Finding, Level
-from hil.setup.scan import Found, Heard
+from hil.setup.scan import TORQUE_ON, Found, Heard
 from hil.setup.servo_settings import Change
 
 _STYLES = {Level.OK: "green", Level.WARNING: "yellow", Level.STOP: "red"}
@@ -62,6 +63,12 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
             say(console, f"ID {servo.id}: {servo.left}")
     if len({servo.baud for servo in servos}) > 1:
         console.print("All servos of an arm must use the same baud rate: see hil setup --help.")
+    if on := [str(servo.id) for servo in servos if TORQUE_ON in servo.trouble and not servo.left]:
+        say(
+            console,
+            f"Torque is on at ID {and_list(on)}: another program drives the servo, or has left it like this. Stop that "
+            "program; if there is none, hold the arm and power-cycle the servo before you type the next command.",
+        )
     if servos:
         print(_after_scan(servos, port))
 

@@ -11,7 +11,7 @@ import pytest
 
 from hil.api import experiment
 from hil.api.progress import OnProgress, Progress, forgiving
-from hil.drivers.errors import BusShared
+from hil.drivers.errors import BusShared, TorqueNotOff
 from hil.errors import Cause, ExperimentError, RunFolderError, SafetyStop, StopRequested
 from hil.estimation import after_a_stop
 from hil.estimator.errors import ConvergenceError, RecordingError
@@ -182,13 +182,16 @@ def test_after_a_motion_that_contradicts_the_description_the_joints_are_moved_by
         assert experiment._how_to_go_on(stop, run, "identify", Path("a.toml"))[-1] == f"Next: hil {command}"
 
 
-def test_a_bus_failure_before_the_first_sample_ends_with_a_command() -> None:
+@pytest.mark.parametrize(
+    ("stopped", "notes"), [(BusShared("Another master"), ["Torque is off."]), (TorqueNotOff("TORQUE IS ON"), [])]
+)
+def test_a_bus_failure_before_the_first_sample_ends_with_a_command(stopped: Exception, notes: list[str]) -> None:
     run: Any = type("Unused", (), {"discard_if_unused": lambda _: True})()
-    stopped = BusShared("Another master")
-    stopped.add_note("Torque is off.")
-    with pytest.raises(BusShared), experiment._discarding(run, "record", Path("a.toml")):
+    for note in notes:
+        stopped.add_note(note)
+    with pytest.raises(type(stopped)), experiment._discarding(run, "record", Path("a.toml")):
         raise stopped
-    assert stopped.__notes__[-1] == "Next: hil check a.toml"
+    assert stopped.__notes__ == [*notes, "Next: hil check a.toml"]
 
 
 def test_a_signal_before_the_first_sample_ends_with_a_check_if_settings_are_in_doubt() -> None:

@@ -140,6 +140,13 @@ def test_after_a_scan_a_device_is_described_and_a_configuration_checked(
     assert capsys.readouterr().out.splitlines()[-1] == f"Next: hil {command}"
 
 
+def test_a_scan_says_what_to_do_about_torque_that_is_on(capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = (Found(1_000_000, number, 1020, "XM430-W350", 48, 12.0, 35.0, "torque on") for number in (1, 2))
+    print_scan([Heard(1_000_000, (first, second._replace(left="A killed run ...")), "")], "/dev/null")
+    said = capsys.readouterr().out
+    assert "Torque is on at ID 1: another program" in said and "at ID 2: another" not in said
+
+
 # check
 
 
