@@ -130,17 +130,23 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
     said = f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."
     if (swapped := _swapped(before, after)) is not None:
         first, second = swapped
+        if first.servo is not second.servo:  # almost all settings of different models differ
+            said = "Another program changed the settings of a servo during the run."
         said += f" {first.title} now has the settings that {second} had: their IDs may have been swapped."
     return said
 
 
 def _swapped(before: Settings, after: Settings) -> tuple[Joint, Joint] | None:
     """Return two servos, the first of which now has all the settings that the second had; None if there is no such
-    pair.
+    pair. If they are of different models, only registers that both have can be compared.
     """
     old, new = _by_joint(before), _by_joint(after)
     for first, second in permutations(old, 2):
-        if old[first] != old[second] == new.get(first):
+        now, then, its_own = new.get(first, {}), old[second], old[first]
+        if first.servo is not second.servo:
+            then = {name: value for name, value in then.items() if name in now}
+            its_own = {name: value for name, value in its_own.items() if name in now}
+        if now and its_own != then == now:
             return first, second
     return None
 

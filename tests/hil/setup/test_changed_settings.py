@@ -6,7 +6,7 @@ from typing import Any, cast
 import pytest
 
 from hil.drivers.joint import Joint
-from hil.drivers.servo_model import servo_model
+from hil.drivers.servo_model import Mode, servo_model
 from hil.errors import Cause
 from hil.setup.changed_settings import changed_settings, settings_now
 
@@ -40,6 +40,19 @@ def test_a_protection_is_named_beside_the_cause_of_a_stop_but_is_none() -> None:
     assert all(
         each in changed_settings(before, both, Cause.POSITION)
         for each in ("Shutdown from 52 to 0", "Limit from 447 to 100")
+    )
+
+
+def test_a_servo_of_another_model_that_answers_with_anothers_settings_may_have_its_id() -> None:
+    other = Joint("elbow", 2, servo_model("XL430-W250"), mode=Mode.PWM)
+    both = "PWM Limit", "Operating Mode"
+    before = dict.fromkeys(((joint, name) for joint in (SHOULDER, other) for name in both), 885)
+    before |= {(SHOULDER, LIMIT): 447, (SHOULDER, both[1]): 0, (other, both[1]): 16}
+    assert "swapped" not in changed_settings(before, {**before, (other, both[0]): 400}, Cause.JUMP)
+    after = {**before, (other, both[1]): 0}
+    assert changed_settings(before, after, Cause.JUMP) == (
+        "Another program changed the settings of a servo during the run. Joint 'elbow' (ID 2, XL430-W250) now has the "
+        "settings that joint 'shoulder' (ID 1, XM430-W350) had: their IDs may have been swapped."
     )
 
 
