@@ -62,7 +62,12 @@ def lost_samples(samples: NDArray[np.void], names: Sequence[str]) -> str:
         if left_out > LOST_SHARE
         else ""
     )
-    cable = "" if left_out > 0.5 * shares.max() else " Check the cable, its connectors and the baud rate."
+    cable = (
+        ""
+        if left_out > 0.5 * shares.max()
+        else " Check the cable, its connectors and the baud rate, and whether other programs keep this computer busy, "
+        "since replies that arrive too late are lost as well."
+    )
     return f"Samples lost: {listed}.{late}{cable}"
 
 
