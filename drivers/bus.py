@@ -311,11 +311,12 @@ class ServoBus(TorqueSwitch):
             self._measured[place].angle(self._servos[self._drives[place]].read("Present Position")) for place in first
         )
 
-    def read_drives(self, joint: Joint) -> tuple[float, ...]:
-        """Read a joint's angle [rad] from each of its servos, in order; see `read_positions`."""
+    def read_drives(self, index: int) -> tuple[float, ...]:
+        """Read the angle [rad] of joint `index` (from 0) from each of its servos, in order; see `read_positions`."""
         return tuple(
-            self._measured[self._drives.index(drive)].angle(self._servos[drive].read("Present Position"))
-            for drive in joint.drives
+            self._measured[place].angle(self._servos[self._drives[place]].read("Present Position"))
+            for place, of in enumerate(self._of)
+            if of == index
         )
 
     def exchange(self, goals: Sequence[float], *, between: bool = False) -> State:

@@ -25,6 +25,7 @@ from hil.estimator.fit.stage1 import fit_lines
 from hil.estimator.selection.prediction import prediction_rms
 
 CUTOFFS = (6.0, 10.0, 15.0, 25.0, 40.0)  # Hz
+HIGHEST_SHARE = 0.45  # highest cut-off frequency as a fraction of the sampling rate; a filter needs less than a half
 WIDTHS = (0.007, 0.02, 0.05, 0.15)  # rad/s
 VELOCITY_NOISES = (1e-4, 1e-3, 1e-2, 1e-1)  # rad/s per sqrt(s)
 SHORT = 0.5  # s; length of the simulations by which settings are compared
@@ -66,7 +67,9 @@ def compare_peers(period: SettledPeriod, length: float | None, gravity: float) -
     def recursive(setting: Setting) -> Fit:
         return fit_recursively([recording], setting[0], setting[1], delay)
 
-    filters = tuple(product(CUTOFFS, WIDTHS))
+    highest = HIGHEST_SHARE * period.rate
+    cutoffs = [cutoff for cutoff in CUTOFFS if cutoff <= highest] or [highest]
+    filters = tuple(product(cutoffs, WIDTHS))
     words = "cut-off {:g} Hz, Coulomb width {:g} rad/s"
     idim = _best("idim_ls", inverse, filters, words, recording, delay)
     yield idim

@@ -13,7 +13,6 @@ from hil.config.joint import JointConfig
 from hil.config.schema import Config
 from hil.description.motion import end_point, moves
 from hil.drivers.clock import Clock
-from hil.drivers.joint import Joint
 from hil.estimator.arrays import Array
 from hil.rest_pose_hint import within_limits
 
@@ -24,7 +23,7 @@ POLL_S = 0.05
 PATIENCE_S = 60.0
 SEVERAL = 0.4  # largest motion of another joint that is not reported, relative to that of the moved joint
 Read = Callable[[], tuple[float, ...]]
-ReadDrives = Callable[[Joint], tuple[float, ...]]
+ReadDrives = Callable[[int], tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -73,11 +72,11 @@ def guided(
     """
     arm, up = described_arm(config), base_up(config)
     for index, joint in enumerate(config.joints):
-        before, drives = np.array(read()), np.array(read_drives(joint.joint))
+        before, drives = np.array(read()), np.array(read_drives(index))
         asked = f"Move {joint.name!r} by hand by about 0.3 rad in the direction that {moves(arm, before, index, up)}."
         ask(asked)
         change = _awaited(read, clock, before)
-        yield judge(config, index, asked, change, np.array(read_drives(joint.joint)) - drives)
+        yield judge(config, index, asked, change, np.array(read_drives(index)) - drives)
 
 
 def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Array) -> Moved:

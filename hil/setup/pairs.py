@@ -21,10 +21,10 @@ def mirrored_pairs(config: Config, bus: ServoBus) -> Iterator[str]:
     joint rarely turn the same way, and two that do are unlikely to read as mirror images by chance. Raises the errors
     of `Servo.read`.
     """
-    for described, joint in zip(config.joints, bus.joints, strict=True):
+    for index, (described, joint) in enumerate(zip(config.joints, bus.joints, strict=True)):
         if len(described.ids) == 1 or len(set(described.directions)) > 1:
             continue
-        first, second = bus.read_drives(joint)
+        first, second = bus.read_drives(index)
         apart, mirrored = (math.remainder(each - first, math.tau) for each in (second, -second))
         if abs(apart) > _DISAGREE_RAD and abs(mirrored) < _AGREE_RAD:
             sign = described.direction

@@ -1,8 +1,11 @@
 """The other methods reach their known accuracy: a comparison with poor implementations would prove nothing."""
 
+from itertools import islice
+
 import numpy as np
 import pytest
 
+from hil.estimator.baselines import compare
 from hil.estimator.baselines.compare import joined
 from hil.estimator.baselines.idim import fit_inverse_dynamics
 from hil.estimator.baselines.kalman import Filter, fit_by_kalman
@@ -88,6 +91,19 @@ def test_linear_lines_are_right_for_small_swings_of_an_arm_without_dry_friction(
         fit_linearised(period, None, 9.81)
     with pytest.raises(ModelError, match="requires gravity"):
         fit_linearised(period, length, 0.0)
+
+
+@pytest.mark.parametrize(("thinned", "tried"), [(8, 3), (20, 1)])
+def test_filters_are_tried_up_to_what_the_rate_allows(
+    ideal_period: SettledPeriod, monkeypatch: pytest.MonkeyPatch, thinned: int, tried: int
+) -> None:
+    """At 50 Hz, a cut-off frequency of 25 Hz is half the rate, which no filter allows."""
+    monkeypatch.setattr(compare, "WIDTHS", (0.05,))
+    torque, position = ideal_period.torque[:, ::thinned], ideal_period.position[:, ::thinned]
+    rate = ideal_period.rate / thinned
+    period = SettledPeriod(rate, torque, position, ideal_period.command_to_sample, ideal_period.position_step)
+    peers = list(islice(compare.compare_peers(period, None, 9.81), 2))
+    assert [(peer.name, peer.tried) for peer in peers] == [("idim_ls", tried), ("rls", tried)]
 
 
 def test_prediction_of_a_settled_period_knows_good_from_bad(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:

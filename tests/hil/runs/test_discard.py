@@ -8,6 +8,7 @@ import pytest
 from hil.config.schema import Config
 from hil.drivers.torque.switch import TorqueSwitch
 from hil.errors import RunFolderError
+from hil.estimation.after_a_stop import after_a_failure
 from hil.experiment import run
 from hil.runs.run_folder import RunFolder
 from tests.support.command_line import hil
@@ -69,6 +70,15 @@ def test_a_folder_without_a_recording_that_cannot_be_removed_is_not_said_to_hold
     assert hil("record", path, "--out", out) == 1
     said = " ".join(capsys.readouterr().err.split())
     assert "Nothing was recorded" in said and "kept" not in said and f"Next: hil check {path}" in said
+
+
+def test_a_run_that_was_set_aside_counts_as_recorded(tmp_path: Path) -> None:
+    """A pilot's run was repeated because it was late, and the repetition was stopped before its first sample."""
+    late = tmp_path / "pilot-1" / "late-1"
+    late.mkdir(parents=True)
+    (late / "samples.npy").write_bytes(b"0")
+    said = after_a_failure(RunFolder(tmp_path), Path("arm.toml"))
+    assert said == [f"The recording up to that point is kept in {tmp_path}.", "Next: hil check arm.toml"]
 
 
 def test_what_was_recorded_stays(identified: Path) -> None:

@@ -122,6 +122,16 @@ def test_patience_ends() -> None:
     assert clock.now() < 61.0
 
 
+@pytest.mark.parametrize("name", ["wx250s", "leg"])
+def test_without_a_hand_each_joint_of_the_fake_arm_is_asked_for(name: str) -> None:
+    """Some joints of the WidowX have two servos."""
+    path = CONFIGS / f"{name}.toml"
+    shown = CliRunner().invoke(app, ["pose", str(path), "--guide", "--json"])
+    assert shown.exit_code == 1 and isinstance(shown.exception, SystemExit), shown.exception
+    moved = json.loads(shown.stdout)["moved"]
+    assert len(moved) == len(load_config(path).joints) and all("did not move" in each["found"] for each in moved)
+
+
 def test_the_pose_of_the_fake_arm_is_its_rest_pose() -> None:
     shown = CliRunner().invoke(app, ["pose", str(ARM.path), "--json"])
     assert shown.exit_code == 0, shown.output
