@@ -186,7 +186,10 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
             stopped.add_note(next_step(command, shown, "--take-over"))
         elif isinstance(stopped, TorqueNotOff) or (
             hasattr(stopped, "__notes__")
-            and (isinstance(stopped, DriverError | ExperimentError) or _is_unsettled(stopped))
+            and (
+                (isinstance(stopped, DriverError | ExperimentError) and not isinstance(stopped, StopRequested))
+                or _is_unsettled(stopped)
+            )
         ):
             stopped.add_note(next_step("check", shown))
         raise

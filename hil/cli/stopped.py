@@ -60,9 +60,18 @@ def same_again(stopped: BaseException) -> list[str]:
 
 
 def _catch() -> dict[signal.Signals, Any]:
-    """Catch the three signals, except those that are already handled or ignored (nohup)."""
+    """Catch the three signals, except those that are already handled, and SIGHUP if it is ignored (nohup).
+
+    A background job of a script inherits SIGINT as ignored, but whoever sends it asks for a stop, which must not be
+    lost before the arm moves.
+    """
     signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    caught = [each for each in signals if signal.getsignal(each) in (signal.SIG_DFL, signal.default_int_handler)]
+    free = (signal.SIG_DFL, signal.default_int_handler)
+    caught = [
+        each
+        for each in signals
+        if signal.getsignal(each) in (free if each is signal.SIGHUP else (*free, signal.SIG_IGN))
+    ]
     return {each: signal.signal(each, _raise) for each in caught}
 
 

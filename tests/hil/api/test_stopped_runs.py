@@ -1,16 +1,21 @@
 """What stopped an arm, and the state of its torque, is what the caller gets: no hint takes its place."""
 
 import re
+import signal
 import threading
+import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import typer
 
 from hil.api import experiment
 from hil.api.progress import OnProgress, Progress, forgiving
+from hil.cli.stopped import stopped_by_signals
 from hil.drivers.errors import BusShared, TorqueNotOff
 from hil.errors import Cause, ExperimentError, RunFolderError, SafetyStop, StopRequested
 from hil.estimation import after_a_stop
@@ -192,6 +197,32 @@ def test_a_bus_failure_before_the_first_sample_ends_with_a_command(stopped: Exce
     with pytest.raises(type(stopped)), experiment._discarding(run, "record", Path("a.toml")):
         raise stopped
     assert stopped.__notes__ == [*notes, "Next: hil check a.toml"]
+
+
+def test_a_signal_before_the_first_sample_leaves_the_command_to_be_typed_again() -> None:
+    run: Any = type("Unused", (), {"discard_if_unused": lambda _: True})()
+    stopped = StopRequested("Stopped by Ctrl-C.")
+    stopped.add_note("Torque is off on both servos.")
+    with pytest.raises(StopRequested), experiment._discarding(run, "record", Path("a.toml")):
+        raise stopped
+    assert stopped.__notes__ == ["Torque is off on both servos."]
+
+
+@pytest.mark.parametrize(
+    ("number", "is_obeyed"), [(signal.SIGINT, True), (signal.SIGTERM, True), (signal.SIGHUP, False)]
+)
+def test_a_stop_request_is_obeyed_though_a_script_has_ignored_it_for_background_jobs(
+    number: signal.Signals, is_obeyed: bool
+) -> None:
+    """With nohup, SIGHUP is ignored on purpose."""
+    former = signal.signal(number, signal.SIG_IGN)
+    try:
+        with pytest.raises(typer.Exit) if is_obeyed else nullcontext(), stopped_by_signals():
+            signal.raise_signal(number)
+            time.sleep(0.001)
+        assert signal.getsignal(number) is signal.SIG_IGN
+    finally:
+        signal.signal(number, former)
 
 
 def test_a_signal_before_the_first_sample_ends_with_a_check_if_settings_are_in_doubt() -> None:
