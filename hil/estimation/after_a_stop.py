@@ -58,7 +58,8 @@ def after_a_failed_estimate(run: RunFolder) -> list[str]:
 
 def _nothing_recorded(run: RunFolder, shown: Path) -> list[str]:
     """Sentences about a folder without data that could not be removed; [] if it holds a recording or a result."""
-    if run.result_path.is_file() or any(run.path.rglob(run.samples_path.name)):
+    # Without free file descriptors, no folder can be searched.
+    if run.result_path.is_file() or run.samples_path.is_file() or any(run.path.rglob(run.samples_path.name)):
         return []
     return [
         f"Nothing was recorded, but {run.path} could not be removed: check that its disk is writable.",
