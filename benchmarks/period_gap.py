@@ -46,7 +46,7 @@ class StandIn:
         self.port = self.prepared = self
         self.exchanges_per_sample = 1
         self.patience = 0.02
-        self.read_back_at = math.inf
+        self.read_back_at, self.awaited_until = math.inf, -math.inf
         self.clock = clock
         self.spent: list[int] = []
         """Processor time before each exchange [ns]."""
@@ -54,6 +54,9 @@ class StandIn:
         self._former: tuple[float, ...] = (0.0,) * len(self.joints)
         self._left_at = 0
         self._rest = self._position = tuple(config.arm.rest_pose)
+
+    def read_torque(self) -> None:
+        """Torque stays on."""
 
     def exchange(self, goals: list[float]) -> State:
         self.spent.append(time.thread_time_ns() - self._left_at)

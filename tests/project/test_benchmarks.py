@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from benchmarks.period_gap import measure
 from tests.support.paths import ROOT
 from tests.support.processes import forked
 
@@ -23,6 +24,12 @@ def test_a_benchmark_starts(name: str) -> None:
     done = forked.run([str(BENCHMARKS / name), "--help"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-500:]
     assert "--json" in done.stdout
+
+
+def test_the_stand_in_for_the_bus_is_one_that_a_stream_can_use() -> None:
+    """The benchmark of period ends replaces the bus, so that it breaks if the stream needs more of it."""
+    measured = measure(1000.0, 2.0)
+    assert measured["exchanges"] > 2 * 2000 and measured["beyond_interval_ms"] >= 0.0
 
 
 @pytest.mark.slow
