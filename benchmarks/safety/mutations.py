@@ -32,7 +32,10 @@ PATIENCE_S = 300
 
 _EXPERIMENT = "tests/hil/experiment"
 TESTS = {
-    "hil/experiment/guard.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/experiment/guard.py": [
+        *(f"{_EXPERIMENT}/{name}" for name in ("test_guard.py", "test_held_at_rest.py", "test_status_check.py")),
+        f"{_EXPERIMENT}/stops",
+    ],
     "hil/experiment/command_limits.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/checks/joint_checks.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/checks/joint_faults.py": [f"{_EXPERIMENT}/test_guard.py", f"{_EXPERIMENT}/stops"],
@@ -89,6 +92,10 @@ EQUIVALENT = {
         "torque * self._falls_to  ->  torque / self._falls_to",
     ): "chain_watch: it is 1, -1 or 0",
     ("self._seen_at = 0.0", "0.0  ->  1.0"): "chain_watch: not used before the first sample",
+    (
+        "self._was_irregular = False",
+        "False  ->  True",
+    ): "guard: after a regular exchange, one more is processed like an irregular one",
     ("for _ in range(0, self._plan.end_samples", "0  ->  1"): "stream: a multiple of the window has as many steps",
     ("ticks.wait() if number else", "0.0  ->  1.0"): "stream: a value that is not used",
     ("_NEVER = ", "62  ->  124"): "exchange: more cycles than any run has",

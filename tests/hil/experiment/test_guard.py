@@ -173,6 +173,14 @@ def test_readings_that_stay_the_same_in_motion_are_old_and_show_no_lost_goals(
     assert stop.value.cause is cause and ("accept goals" in str(stop.value)) == (velocity == 0.0)
 
 
+def test_the_longest_gap_between_two_exchanges_is_remembered(arm: Arm) -> None:
+    """It tells whether this program, by sending nothing, may have tripped a watchdog itself."""
+    guard = Guard(arm())
+    for number, gap in enumerate((0.0, 0.012, 0.004)):
+        guard.look(at(number, STILL), gap)
+    assert guard._status.longest_gap == 0.012
+
+
 def test_an_arm_that_is_lowered_may_be_silent_longer(arm: Arm) -> None:
     """Counted from the last exchange that all servos answered, which may be older than the lowering."""
     silent = MISSING._replace(missing=(True, True))
