@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from random import Random
 from typing import NamedTuple
@@ -322,23 +322,13 @@ class ReadBack:
 
     def _other_limits(self, servos: Sequence[Answer]) -> list[Overruled]:
         """Return the limits that differ from what this program wrote or found."""
-        return [
-            Overruled(place, *each)
-            for place, (answer, limits) in enumerate(zip(servos, self._limits, strict=True))
-            if answer is not None
-            for each in zip(self._names_of_limits[place], answer[2:-1], limits, strict=True)
-            if each[1] != each[2]
-        ]
+        held = [answer and answer[2:-1] for answer in servos]
+        return list(_differing(held, self._names_of_limits, self._limits))
 
     def _other_settings(self, servos: Sequence[Answer]) -> list[Overruled]:
         """Return, for each servo, the first setting that differs from what this program wrote or found."""
-        found = []
-        for place, (answer, modes) in enumerate(zip(servos, self._modes, strict=True)):
-            if answer is None or answer[-len(modes) :] == modes:
-                continue
-            held = zip(self._settings, answer[-len(modes) :], modes, strict=True)
-            found.append(next(Overruled(place, *each) for each in held if each[1] != each[2]))
-        return found
+        held = [answer and answer[-len(self._settings) :] for answer in servos]
+        return list(_differing(held, [self._settings] * len(held), self._modes))
 
     def _count_missed(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> None:
         """Count a missed goal for each servo that still holds an earlier goal from this program."""
@@ -349,6 +339,16 @@ class ReadBack:
             missed.append(self._looks[place])
             if len(missed) == LOST_GOALS and self._looks[place] - missed[0] < LOST_OF:
                 self.lost = Overruled(place, self._goals[place], answer[-1], sent[-1][place])
+
+
+def _differing(
+    held: Sequence[tuple[int, ...] | None], names: Sequence[Sequence[str]], expected: Sequence[tuple[int, ...]]
+) -> Iterator[Overruled]:
+    """Yield, for each servo that answered, the first value that differs from the expected one."""
+    for place, (values, wanted) in enumerate(zip(held, expected, strict=True)):
+        if values is not None and values != wanted:
+            each = zip(names[place], values, wanted, strict=True)
+            yield next(Overruled(place, *one) for one in each if one[1] != one[2])
 
 
 def _of_one(servo_id: int, span: Span) -> GroupRead:

@@ -438,7 +438,8 @@ class EmulatedServo(Powered):
         self._is_limited = self._voltage_limited or (self._mode == CURRENT_MODE and most < FULL_PWM)
         """Whether the supply, PWM Limit or Goal PWM may limit the current in current mode."""
 
-        self.needs_ticks = self.health.changes or (moves and (self._mode != CURRENT_MODE or self._is_limited))
+        is_controlled = moves and (self._mode != CURRENT_MODE or self._is_limited)
+        self.needs_ticks = self.health.changes or is_controlled
         """Whether the servo's state changes with time alone, so that the bus must call `tick`."""
 
         if self._driven and self._is_limited:  # the next step of the servo's loop applies the goal
@@ -457,7 +458,7 @@ class EmulatedServo(Powered):
         # The fast path bypasses the controller, which limits the current by the supply or, in one mode, by the goal.
         by_controller = self._is_limited or self._mode == CURRENT_POSITION_MODE
         self._takes_goal_current = accepts and not by_controller and self._current_limit >= 0
-        if not (moves and (self._mode != CURRENT_MODE or self._is_limited)):
+        if not is_controlled:
             self._applied_share = None
         if self.needs_ticks:
             self.controller.goals = Goals.read(self._mode, memory)

@@ -36,15 +36,19 @@ def look(back: ReadBack, now: float, *, goal: int = OURS, mode: int = MODE, limi
     return back.look(servos, [[LONG_AGO, 56], *SENT * 2], now)
 
 
-@pytest.mark.parametrize(("goal", "proof"), [(FOREIGN, 2), (LONG_AGO, 3), (0, 3)])
-def test_the_second_foreign_goal_is_proof_the_third_of_one_that_lost_writes_may_leave(goal: int, proof: int) -> None:
-    back = read_back()
+def proof_of(back: ReadBack, *, of_modes: bool = False, **held: int) -> tuple[int, Overruled]:
+    """Read back until something is proof; return how many read-backs of that kind it took, and what was found."""
     seen, now, found = 0, 0.0, None
     while found is None:
-        seen += not reads_modes(back)
+        seen += reads_modes(back) == of_modes
         now += 0.01
-        found = look(back, now, goal=goal)
-    assert seen == proof and found == Overruled(1, "Goal Current", goal, OURS)
+        found = look(back, now, **held)
+    return seen, found
+
+
+@pytest.mark.parametrize(("goal", "proof"), [(FOREIGN, 2), (LONG_AGO, 3), (0, 3)])
+def test_the_second_foreign_goal_is_proof_the_third_of_one_that_lost_writes_may_leave(goal: int, proof: int) -> None:
+    assert proof_of(read_back(), goal=goal) == (proof, Overruled(1, "Goal Current", goal, OURS))
 
 
 @pytest.mark.parametrize("register", ["Drive Mode", "Operating Mode", "Homing Offset"])
@@ -79,25 +83,15 @@ def test_different_goals_of_ours_are_what_lost_writes_leave() -> None:
 
 
 def test_the_second_foreign_mode_is_proof() -> None:
-    back = read_back()
-    seen, now, found = 0, 0.0, None
-    while found is None:
-        seen += reads_modes(back)
-        now += 0.01
-        found = look(back, now, mode=OTHER_MODE)
-    assert seen == 2 and found == Overruled(1, "Operating Mode", OTHER_MODE, MODE)
+    found = Overruled(1, "Operating Mode", OTHER_MODE, MODE)
+    assert proof_of(read_back(), of_modes=True, mode=OTHER_MODE) == (2, found)
 
 
 @pytest.mark.parametrize("limit", [0, LIMIT - 1])
 def test_the_second_foreign_limit_is_proof_although_the_goals_are_ours(limit: int) -> None:
     back = read_back()
-    seen, now, found = 0, 0.0, None
-    while found is None:
-        seen += not reads_modes(back)
-        now += 0.01
-        found = look(back, now, limit=limit)
-    assert seen == 2 and back.is_unexpected
-    assert found == Overruled(1, "Goal PWM", limit, LIMIT)
+    assert proof_of(back, limit=limit) == (2, Overruled(1, "Goal PWM", limit, LIMIT))
+    assert back.is_unexpected
 
 
 @pytest.mark.parametrize(

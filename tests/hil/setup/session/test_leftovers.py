@@ -142,6 +142,11 @@ def silent_while_restoring(bench: Bench, monkeypatch: pytest.MonkeyPatch, second
     monkeypatch.setattr(bench.port, "write", silencing)
 
 
+def restoring(command: str, config: Config) -> list[object]:
+    """A command that restores what a killed run left: `hil setup` of servo 2, or `hil check` of the arm."""
+    return ["setup", config.url, "--id", 2, "--yes"] if command == "setup" else ["check", config.path]
+
+
 @pytest.mark.parametrize("command", ["setup", "check"])
 def test_a_servo_that_reboots_while_it_is_restored_is_tried_again(
     command: str, arm: Arm, bench: Bench, kill: Any, state_folder: Path, monkeypatch: pytest.MonkeyPatch
@@ -149,8 +154,7 @@ def test_a_servo_that_reboots_while_it_is_restored_is_tried_again(
     config = arm(SHORT)
     kill(config)
     silent_while_restoring(bench, monkeypatch, 0.3)
-    words = ["setup", config.url, "--id", 2, "--yes"] if command == "setup" else ["check", config.path]
-    assert hil(*words) == 0
+    assert hil(*restoring(command, config)) == 0
     assert bench.changed() == [] and list(state_folder.glob("*.json")) == []
 
 
@@ -167,8 +171,7 @@ def test_a_command_that_leaves_a_servo_unrestored_ends_with_an_error(
     config = arm(SHORT)
     kill(config)
     silent_while_restoring(bench, monkeypatch, 20.0)
-    words = ["setup", config.url, "--id", 2, "--yes"] if command == "setup" else ["check", config.path]
-    assert hil(*words) == 1
+    assert hil(*restoring(command, config)) == 1
     said = " ".join("".join(capsys.readouterr()).split())
     assert "not yet restored after an earlier run" in said or "settings from an earlier run: cannot be restored" in said
     assert "too late" not in said, "no reply was"
@@ -191,8 +194,7 @@ def test_a_signal_while_servos_are_restored_leaves_no_doubt_about_torque(
         signal.raise_signal(signal.SIGTERM)
 
     monkeypatch.setattr(killed_run, "put_back", stopped)
-    words = ["setup", config.url, "--id", 2, "--yes"] if command == "setup" else ["check", config.path]
-    assert hil(*words) == 128 + signal.SIGTERM
+    assert hil(*restoring(command, config)) == 128 + signal.SIGTERM
     said = capsys.readouterr().err
     torque = next(line for line in said.splitlines() if "perhaps with TORQUE ON" in line)
     assert [number for number in (1, 2) if f"ID {number} (" in torque] == [1, 2]
