@@ -182,12 +182,17 @@ def _example(table: Table) -> str:
     driven = driven or rest[:joints]
     if len(position) != len(driven) or not position:
         time, position, drive, driven = "time", ["q1", "q2"], "torque", ["tau1", "tau2"]
-    when = f"time = {_quoted(time)}" if time is not None else "rate = 200.0  # samples per second"
-    listed = [f"{key} = [{', '.join(map(_quoted, names))}]" for key, names in (("position", position), (drive, driven))]
-    return "\n".join(("[columns]", when, *listed))
+    when = f"time = {quoted(time)}" if time is not None else "rate = 200.0  # samples per second"
+    return "\n".join(("[columns]", when, listed("position", position), listed(drive, driven)))
 
 
-def _quoted(name: str) -> str:
+def listed(key: str, names: Iterable[str]) -> str:
+    """The line of a TOML file that gives the names of columns."""
+    return f"{key} = [{', '.join(map(quoted, names))}]"
+
+
+def quoted(name: str) -> str:
+    """The name of a column, as in a TOML file."""
     return json.dumps(name, ensure_ascii=False)
 
 

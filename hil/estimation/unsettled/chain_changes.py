@@ -12,6 +12,7 @@ from hil.estimation.torque_constants import capitalised
 from hil.estimation.unsettled.slips import unexplained
 from hil.estimator.chain.column_changes import ColumnChange, ColumnSearch, Suspected
 from hil.estimator.chain.column_faults import ColumnCheck
+from hil.recordings.guess import listed, quoted
 
 HALF = 0.5  # largest ratio of the torque residuals at which an estimate would be useless
 
@@ -69,7 +70,7 @@ def _exchange(change: ColumnChange, names: Sequence[str], columns: Columns) -> t
     for key in _keys(change, columns):
         order = list(getattr(columns, key))
         order[first], order[second] = order[second], order[first]
-        keys.append(f"{key} = [{', '.join(map(_quoted, order))}]")
+        keys.append(listed(key, order))
     kinds = {"position": "positions", "torque": "torques", "both": "torques and positions"}[change.columns]
     return (
         f"the {kinds} of {names[first]} and {names[second]} seem to be swapped",
@@ -78,14 +79,14 @@ def _exchange(change: ColumnChange, names: Sequence[str], columns: Columns) -> t
 
 
 def _direction(change: ColumnChange, names: Sequence[str], columns: Columns) -> tuple[str, str]:
-    listed = [getattr(columns, key)[joint] for key in _keys(change, columns) for joint in change.joints]
+    reversed_ = [getattr(columns, key)[joint] for key in _keys(change, columns) for joint in change.joints]
     kinds = {"position": "position", "torque": "torque", "both": "torque and the position"}[change.columns]
-    several, of_all = len(listed) > 1, len(change.joints) > 1
+    several, of_all = len(reversed_) > 1, len(change.joints) > 1
     joints = "all joints" if of_all else names[change.joints[0]]
     instead = f", or reverse the axis of {joints} in the description of the arm" if change.columns == "both" else ""
     return (
         f"the sign{'s' if several else ''} of the {kinds} of {joints} {'are' if several else 'is'} reversed",
-        f"multiply {', '.join(map(_quoted, listed))} by -1 in the file{instead}",
+        f"multiply {', '.join(map(quoted, reversed_))} by -1 in the file{instead}",
     )
 
 
@@ -105,7 +106,7 @@ def _ratio(change: ColumnChange, names: Sequence[str], columns: Columns) -> tupl
     factor = f"{1.0 / change.factor:.4g}"
     return (
         f"the angles of {names[joint]} seem to be {factor} times the true ones, as if by a gear ratio",
-        f"divide {_quoted(columns.position[joint])} by {factor} in the file",
+        f"divide {quoted(columns.position[joint])} by {factor} in the file",
     )
 
 
@@ -126,10 +127,6 @@ def _keys(change: ColumnChange, columns: Columns) -> list[str]:
 
 def _kind(key: str) -> str:
     return "position" if key == "position" else "torque"
-
-
-def _quoted(name: str) -> str:
-    return f'"{name}"'
 
 
 def _wrapped(angle: float) -> float:
