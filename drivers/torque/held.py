@@ -113,8 +113,8 @@ def let_sink(held: Mapping[Joint, Servo], clock: Clock, originals: Originals | N
     except BaseException as ended:
         if lowered := lowering.lowered:
             ended.add_note(
-                f"{HALF_DOWN}, with lowered goals: {lowered}. Hold the arm by hand and start again with --take-over, "
-                "which lets it down completely."
+                f"{HALF_DOWN}, with goals that this program lowered: {lowered}. Hold the arm by hand and start again "
+                "with --take-over, which lets it down completely."
             )
         raise
     lowering.cut()

@@ -14,10 +14,14 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a check: where it was made, what was checked, what was found, and how to fix it if necessary."""
+    """Result of a check: where it was made, what was checked, what was found, and how to fix it if necessary.
+
+    step: the command that fixes it, if it is not the same check again after the fix.
+    """
 
     level: Level
     where: str
     what: str
     found: str
     fix: str = ""
+    step: str = ""

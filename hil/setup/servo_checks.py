@@ -13,12 +13,11 @@ from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself
 from hil.drivers.preparation.unsuitable import APPLY_HOMING, ignored_homing, unsuitable_drive_mode
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
-from hil.next_step import command
 from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.setup.finding import Finding, Level
 from hil.setup.servo_settings import POWER_CYCLE
-from hil.setup.session.killed_run import half_let_down, left_behind, recover_patiently
-from hil.setup.session.leftovers import not_restored
+from hil.setup.session.killed_run import HalfLetDown, half_let_down, left_behind, recover_patiently
+from hil.setup.session.leftovers import not_restored, taking_over
 from hil.setup.session.settings_file import DamagedSettings
 
 _WARM_BELOW_LIMIT_C = 15
@@ -78,7 +77,8 @@ def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding
         yield Finding(Level.STOP, str(joint), what, "cannot be read", str(error))
         return
     except DriverError as error:
-        yield Finding(Level.STOP, str(joint), what, "cannot be restored", str(error))
+        step = taking_over(config) if isinstance(error, HalfLetDown) else ""
+        yield Finding(Level.STOP, str(joint), what, "cannot be restored", str(error), step)
         return
     if written := ", ".join(restored.written):
         yield Finding(Level.OK, str(joint), what, f"that run ended before restoring them; restored now: {written}")
@@ -126,14 +126,10 @@ def _torque(config: Config, _joint_config: JointConfig, joint: Joint, servo: Ser
     fix = "Another program is driving it: stop that program first, or power-cycle the servo."
     kept = left_behind(config.url, joint) if torque else None
     if kept is not None and half_let_down(kept, servo):
-        fix = f"An earlier hil run left it on. Hold the arm by hand, then type: {_taking_over(config)}"
+        fix = f"An earlier hil run left it on. Hold the arm by hand, then type: {taking_over(config)}"
     elif torque and servo.read("Bus Watchdog") == WATCHDOG_TRIPPED:
         fix = f"A program left it on when it ended, and the servo's watchdog has tripped. {POWER_CYCLE}"
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
-
-
-def _taking_over(config: Config) -> str:
-    return command("identify" if config.experiment.pilot else "record", config.path, "--take-over")
 
 
 def _drive_mode(config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -15,6 +16,8 @@ from hil.printing import print_fitting, result_console, say, say_behind
 from hil.setup.finding import Finding, Level
 from hil.setup.scan import TORQUE_ON, Found, Heard
 from hil.setup.servo_settings import Change
+
+_MOST_PLANAR_JOINTS = 2
 
 _STYLES = {Level.OK: "green", Level.WARNING: "yellow", Level.STOP: "red"}
 
@@ -70,7 +73,18 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
             "program; if there is none, hold the arm and power-cycle the servo before you type the next command.",
         )
     if servos:
-        print(_after_scan(servos, port))
+        _print_next(console, servos, port)
+
+
+def _print_next(console: Console, servos: Sequence[Found], port: str) -> None:
+    after = _after_scan(servos, port)
+    if after == _describing(port) and len(servos) > _MOST_PLANAR_JOINTS:
+        say(
+            console,
+            f"`hil init` describes arms of one or two joints. If these {len(servos)} servos belong to one arm, write "
+            "its file as docs/estimating.md explains (Spatial arms), then type: hil check my_arm.toml",
+        )
+    print(after)
 
 
 def _after_scan(servos: Sequence[Found], port: str) -> str:
@@ -85,6 +99,10 @@ def _after_scan(servos: Sequence[Found], port: str) -> str:
         other = min(servos, key=lambda servo: servo.baud)
         common = max(servo.baud for servo in servos)
         return next_step("setup", port, "--baud", other.baud, "--id", other.id, "--new-baud", common)
+    return _describing(port)
+
+
+def _describing(port: str) -> str:
     return next_step("init", port, "--out", "my_arm.toml")
 
 
@@ -109,6 +127,9 @@ def print_findings(findings: Sequence[Finding], config: Path, *, has_dry_run: bo
         say(console, f"\n{_counted(stops, 'blocking problem')}, {_counted(warnings, 'warning')}. Fix them.")
     else:
         say(console, f"\nReady, {_counted(warnings, 'warning')}.")
+    if step := next((finding.step for finding in findings if finding.step), ""):
+        print(f"{NEXT}{step}")
+        return
     print(next_step("check" if stops else "dry-run" if has_dry_run else "identify", config))
 
 

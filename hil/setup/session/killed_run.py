@@ -14,12 +14,19 @@ from hil.drivers.servo import Servo
 from hil.setup.session import settings_file
 from hil.setup.session.settings_file import Kept
 
-__all__ = ["REBOOT_S", "Left", "Restored", "left_behind", "recover", "recover_patiently", "what_is_left"]
+__all__ = ["REBOOT_S", "HalfLetDown", "Left", "Restored", "left_behind", "recover", "recover_patiently", "what_is_left"]
 
 REBOOT_S = 0.6
 """A servo that does not answer may be booting, so it is tried again after this time [s]."""
 
+_LOWERED = ("Goal PWM", "Goal Current")
+"""The registers that change while an arm is let down (`hil.drivers.torque.held`)."""
+
 _MODE, _CURRENT_LIMIT = "Operating Mode", "Current Limit"
+
+
+class HalfLetDown(TorqueHeld):
+    """An earlier program ended while it was letting this servo's joint down (--take-over); its torque is on."""
 
 
 def left_behind(port: str, joint: Joint) -> Kept | None:
@@ -85,15 +92,25 @@ def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
     Raises the same errors as `Servo.read`.
 
     If another program changed the Operating Mode, the present goals and gains belong to the new mode and are left as
-    they are.
+    they are. A program that only began to let the arm down changed nothing but its goals; whatever else differs is due
+    to a power cycle, or this is another arm's servo, on a port of the same name.
     """
+    if kept.was_held and all(kept.settings.get(name) == value for name, value in kept.changed.items()):
+        lowered = {name: kept.settings[name] for name in _LOWERED if name in kept.settings}
+        wanted = {**present, **lowered}
+        return _left(kept, servo, wanted, {}, present)
     changed = {
         name: present[name]
         for name, value in kept.changed.items()
         if name in present and name in kept.settings and present[name] not in (value, kept.settings[name])
     }
     settings = {**present, **{name: kept.settings[name] for name in kept.changed if name in kept.settings}}
-    wanted = {**(settings if _MODE in changed else kept.settings), **changed}
+    return _left(kept, servo, {**(settings if _MODE in changed else kept.settings), **changed}, changed, present)
+
+
+def _left(
+    kept: Kept, servo: Servo, wanted: dict[str, int], changed: dict[str, int], present: Mapping[str, int]
+) -> Left:
     possible = attainable(servo, wanted)
     differing = {name: (present.get(name), value) for name, value in possible.items() if present.get(name) != value}
     return Left(kept, wanted, changed, differing)
@@ -130,13 +147,13 @@ def half_let_down(kept: Kept, servo: Servo) -> str:
 def switch_off_left(servo: Servo, kept: Kept) -> bool:
     """Switch off torque that the killed program left on; return whether it was on.
 
-    Raises TorqueHeld if another program has switched it on since, and the errors of `Servo.write`.
+    Raises HalfLetDown, TorqueHeld if another program has switched it on since, and the errors of `Servo.write`.
     """
     if is_left_on(servo, kept):
         servo.write("Torque Enable", 0)
         return True
     if told := half_let_down(kept, servo):
-        raise TorqueHeld(f"{servo.title}: {told}")
+        raise HalfLetDown(f"{servo.title}: {told}")
     if servo.read("Torque Enable"):
         raise TorqueHeld(
             f"{servo.title}: its torque is on in Operating Mode {servo.read(_MODE)}, but an earlier run "

@@ -5,7 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from hil.config.schema import load_config
+from hil.config.schema import Config, load_config
 from hil.drivers.control_table import load_control_table, model_names
 from hil.drivers.errors import DriverError, NoReply, PortLost, WrongModel
 from hil.drivers.packet import MAX_ID
@@ -96,7 +96,12 @@ def _restoring(kept: Kept, port: Port) -> str:
 def _taking_over(kept: Kept, port: Port) -> str:
     """The command that lets the arm down and restores a servo; "" if the run's configuration no longer describes it."""
     is_described = kept.config and _describes(Path(kept.config), kept, port)
-    return command("record", kept.config, "--take-over") if is_described else ""
+    return taking_over(load_config(Path(kept.config))) if is_described else ""
+
+
+def taking_over(config: Config) -> str:
+    """The command that lets an arm down whose torque is on, then runs its experiment."""
+    return command("identify" if config.experiment.pilot else "record", config.path, "--take-over")
 
 
 def _describes(path: Path, kept: Kept, port: Port) -> bool:

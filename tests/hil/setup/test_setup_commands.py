@@ -74,6 +74,12 @@ def test_scan_says_what_ails_a_servo(port: Callable[..., Port]) -> None:
     assert heard.servos[1].trouble == "hardware error: input voltage; reboot it"
 
 
+def test_scan_of_more_servos_than_init_describes_says_so() -> None:
+    out = invoke("scan", "fake://configs/leg.toml", "--baud", 1_000_000).output
+    assert "`hil init` describes arms of one or two joints" in out and "docs/estimating.md" in out
+    assert "describes arms" not in invoke("scan", "fake://configs/fake_two_link.toml", "--baud", 1_000_000).output
+
+
 def test_scan_hears_that_answers_are_damaged(port: Callable[..., Port], monkeypatch: pytest.MonkeyPatch) -> None:
     read = FakeBus.read
     monkeypatch.setattr(FakeBus, "read", lambda bus, *a: read(bus, *a).replace(b"\x55", b"\x54"))

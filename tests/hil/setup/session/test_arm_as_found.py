@@ -156,7 +156,7 @@ def test_a_stop_while_the_arm_sinks_tells_what_was_lowered(
         pass
     said = "\n".join(stopped.value.__notes__)
     assert "TORQUE IS ON" in said
-    assert "lowered goals: Goal PWM of ID 1, originally 885, Goal PWM of ID 2, originally 885." in said
+    assert "lowered: Goal PWM of ID 1, originally 885, Goal PWM of ID 2, originally 885." in said
     assert all(0 < servo.value("Goal PWM") < 885 and servo.torque_enabled for servo in bench.servos.values())
 
 

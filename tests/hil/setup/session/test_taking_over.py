@@ -16,6 +16,7 @@ from hil.setup.session import settings_file
 from hil.setup.session.servo_session import lay_at_start, servo_session
 from hil.setup.unmoved import MOST_RAD, where_it_lies
 from tests.support.bench import SHORT, Arm, Bench
+from tests.support.command_line import hil
 
 GOAL_PWM = 600
 SERVO_1, SERVO_2 = (f"[[fake.servos]]\nid = {each}\n" for each in (1, 2))
@@ -139,8 +140,23 @@ def test_once_its_torque_is_off_a_check_restores_an_arm_that_was_half_let_down(
     half_let_down(config, bench, monkeypatch)
     for servo in bench.servos.values():
         servo.write(64, b"\x00")
+        servo.write(112, (60).to_bytes(4, "little"))  # Profile Velocity, which the take-over had not changed
     assert sum(f"-> {GOAL_PWM}" in each.found for each in check_arm(config)) == 2
+    assert all(servo.value("Profile Velocity") == 60 for servo in bench.servos.values())
     assert all(servo.value("Goal PWM") == GOAL_PWM for servo in bench.servos.values()) and on_file() == []
+
+
+@pytest.mark.parametrize(("pilot", "again"), [(False, "record"), (True, "identify")])
+def test_scan_and_check_name_the_command_that_lets_a_half_let_down_arm_down(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], pilot: bool, again: str
+) -> None:
+    lengths = ("[arm]\n", "[arm]\nlink_lengths = [0.147, 0.18]\n")
+    config = arm(SHORT, lengths, ("[experiment]\n", f"[experiment]\npilot = {str(pilot).lower()}\n"))
+    half_let_down(config, bench, monkeypatch)
+    for command in (("scan", config.url, "--baud", 1_000_000), ("check", config.path)):
+        capsys.readouterr()
+        hil(*command)
+        assert capsys.readouterr().out.splitlines()[-1] == f"Next: hil {again} {config.path} --take-over"
 
 
 def test_a_take_over_that_is_stopped_before_it_lowers_anything_leaves_nothing(arm: Arm, bench: Bench) -> None:
