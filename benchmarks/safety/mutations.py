@@ -52,7 +52,7 @@ TESTS = {
     "hil/experiment/stop_request.py": [f"{_EXPERIMENT}/test_stop_request.py"],
     "hil/plan/silence.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/plan/brake.py": ["tests/hil/plan/test_brake.py"],
-    "hil/plan/recent_motion.py": ["tests/hil/plan/test_brake.py", f"{_EXPERIMENT}/test_guard.py"],
+    "hil/plan/recent_motion.py": ["tests/hil/plan/test_recent_motion.py", "tests/hil/plan/test_brake.py"],
     "hil/experiment/pace.py": [f"{_EXPERIMENT}/stream/test_stream_schedule.py"],
     "hil/experiment/stream.py": [
         f"{_EXPERIMENT}/stream/test_stream_schedule.py",
@@ -98,6 +98,9 @@ EQUIVALENT = {
     ): "guard: after a regular exchange, one more is processed like an irregular one",
     ("for _ in range(0, self._plan.end_samples", "0  ->  1"): "stream: a multiple of the window has as many steps",
     ("ticks.wait() if number else", "0.0  ->  1.0"): "stream: a value that is not used",
+    ("abs(travels[-1].moved)", "-1  ->  +1"): "recent_motion: the last of two",
+    ("self._states: deque[State]", "3  ->  6"): "recent_motion: more exchanges are kept than are used",
+    ("low = max((each.low", "0.0  ->  1.0"): "recent_motion: without any travel, the upper end is 0 as well",
     ("_NEVER = ", "62  ->  124"): "exchange: more cycles than any run has",
     ("self._modes_due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: the first comparison sets it",
     (
