@@ -28,7 +28,7 @@ import numba
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 300
+PATIENCE_S = 120
 
 _EXPERIMENT = "tests/hil/experiment"
 TESTS = {
