@@ -38,7 +38,6 @@ class Registers:
         self.written.append((register, value))
 
 
-
 @pytest.mark.parametrize(
     ("held", "rebooted"),
     [
