@@ -1,4 +1,4 @@
-"""Torque that another program holds on, servos confirmed later, and faults, as an arm's bus reports and handles them."""
+"""Torque that another program holds on, servos confirmed later, and faults, as a bus reports and handles them."""
 
 from collections.abc import Callable
 from typing import Any
