@@ -28,7 +28,7 @@ import numba
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 300
+PATIENCE_S = 120
 
 _EXPERIMENT = "tests/hil/experiment"
 TESTS = {
@@ -71,8 +71,14 @@ TESTS = {
         "tests/drivers/test_exchange.py",
     ],
     "hil/drivers/others/read_back.py": ["tests/drivers/test_sightings.py", "tests/drivers/test_read_back.py"],
-    "hil/drivers/torque/switch.py": ["tests/drivers/torque/test_switch.py"],
-    "hil/drivers/torque/off.py": ["tests/drivers/torque/test_off.py"],
+    "hil/drivers/torque/switch.py": [
+        "tests/drivers/torque/test_switch.py",
+        "tests/drivers/torque/test_reports.py",
+    ],
+    "hil/drivers/torque/off.py": [
+        "tests/drivers/torque/test_off.py",
+        "tests/drivers/torque/test_answers_again.py",
+    ],
     "hil/estimator/models/standstill.py": ["tests/estimator/models/test_standstill.py"],
     "hil/experiment/chain_watch.py": [f"{_EXPERIMENT}/test_chain_watch.py"],
     "hil/runs/recording.py": ["tests/hil/runs/test_recording.py"],

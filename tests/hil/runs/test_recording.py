@@ -228,3 +228,34 @@ def test_the_whole_file_is_reserved_and_an_empty_one_is_not_mapped(
     assert asked == [(0, path.stat().st_size)]
     recorder.close()
     assert recorder.samples.shape == (0,) and recorder.samples.dtype == sample_type(2)
+
+
+def test_a_recording_closed_twice_is_not_touched_again(tmp_path: Path) -> None:
+    path = tmp_path / "samples.npy"
+    recorder = Recorder(path, 2, 9)
+    recorder.keep(7.0, Phase.REST, 0, -1, state(1))
+    recorder.close()
+    path.unlink()
+    recorder.close()
+    assert not path.exists()
+
+
+def test_small_files_are_saved_again_even_if_the_parent_is_gone_too(tmp_path: Path) -> None:
+    path = tmp_path / "runs" / "run" / "samples.npy"
+    path.parent.mkdir(parents=True)
+    for name, size in (("small", 3 << 20), ("large", 5 << 20)):
+        with (path.parent / name).open("wb") as file:
+            file.truncate(size)
+    with pytest.raises(RunFolderError, match="saved again"), Recorder(path, 2, 9) as recorder:
+        recorder.keep(7.0, Phase.REST, 0, -1, state(1))
+        shutil.rmtree(tmp_path / "runs")
+    assert sorted(each.name for each in path.parent.iterdir()) == ["samples.npy", "small"]
+
+
+def test_the_header_of_a_cut_recording_says_what_numpy_would_write(tmp_path: Path) -> None:
+    path = tmp_path / "samples.npy"
+    with Recorder(path, 2, 9) as recorder:
+        recorder.keep(7.0, Phase.REST, 0, -1, state(1))
+    with path.open("rb") as file:
+        assert np.lib.format.read_magic(file) == (1, 0)
+        assert np.lib.format.read_array_header_1_0(file) == ((1,), False, sample_type(2))

@@ -485,3 +485,46 @@ def test_a_stopped_arm_is_lowered_or_braked_or_neither(
     with pytest.raises(ExperimentError):
         stream.run()
     assert done == ([does] if does else [])
+
+
+@pytest.mark.parametrize("turns", [1, 5])
+def test_the_guard_is_told_how_far_apart_exchanges_are(make: Make, monkeypatch: pytest.MonkeyPatch, turns: int) -> None:
+    given: list[float] = []
+
+    class Timed(Checks):
+        def __init__(self, *_: Any, interval: float, **__: Any) -> None:
+            super().__init__()
+            given.append(interval)
+
+    monkeypatch.setattr(module, "Guard", Timed)
+    make(rate=20.0, turns=turns)
+    assert given == [pytest.approx(0.05 / turns)]
+
+
+def test_progress_shows_the_peak_torque_of_each_joint(make: Make) -> None:
+    seen: list[Progress] = []
+    stream, _, _ = make(20.0, watch=seen.append)
+    play(stream, [0.1])
+    expected = [0.1 * joint.torque_per_goal for joint in stream._config.joints]
+    assert seen[0].peak_torque == pytest.approx(expected)
+
+
+def test_a_state_with_a_missing_reply_does_not_replace_the_latest_whole_one(make: Make) -> None:
+    stream, _, _ = make()
+    whole = play(stream, [0.1])
+    assert stream._whole is whole
+    stream._look(whole._replace(missing=(False, True)), Phase.PERIODIC)
+    assert stream._whole is whole
+
+
+def test_a_stop_by_lost_torque_says_nothing_about_the_motion(make: Make) -> None:
+    stream, bus, guard = make()
+    bus.torque_lost = 1
+
+    def torque_is_off(_: int) -> None:
+        raise SafetyStop("no torque", Cause.NOT_FOLLOWING)
+
+    guard.torque_is_off = torque_is_off  # type: ignore[attr-defined]
+    with pytest.raises(SafetyStop, match="no torque Symptom") as stop:
+        stream._name_lost_torque(SafetyStop("x", Cause.FROZEN))
+    assert stop.value.overruled
