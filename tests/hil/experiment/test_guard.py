@@ -371,6 +371,28 @@ def test_late_deadlines_and_a_gap_that_trips_watchdogs(arm: Arm) -> None:
         Guard(arm()).look(STILL, 0.12)
 
 
+def test_an_exchange_between_two_samples_does_not_make_up_for_a_missed_deadline(arm: Arm) -> None:
+    guard = Guard(arm())
+    for number in range(20):
+        guard.late()
+        guard.look(at(number, STILL), between=True)
+    with pytest.raises(SafetyStop, match="21 deadlines in a row"):
+        guard.late()
+
+
+@pytest.mark.parametrize(("took", "allowed"), [(0.0039, 15), (0.0041, 50)])
+def test_an_exchange_that_ends_1_ms_after_its_patience_shows_a_busy_computer(
+    arm: Arm, took: float, allowed: int
+) -> None:
+    """Silence of all servos may then be due to the computer."""
+    guard = Guard(arm(), patience=0.003)
+    guard.look(STILL._replace(time_after_read=took))
+    silent = MISSING._replace(missing=(True, True), position=(nan, nan), velocity=(nan, nan), current=(nan, nan))
+    with pytest.raises(SafetyStop, match=f"allows {allowed} ms"):
+        for number in range(1, 40):
+            guard.look(at(number, silent))
+
+
 def test_late_deadlines_stop_before_a_short_watchdog_acts(arm: Arm) -> None:
     guard = Guard(arm(("[experiment]\n", "[safety]\nwatchdog = 0.04\n\n[experiment]\n")))
     for _ in range(12):

@@ -278,3 +278,33 @@ def test_another_servos_clock_may_have_drifted_since_its_last_reading(arm: Arm) 
         clocked(check, [6.5] * 3)
         wrong = [check.look_at_clock(0, lead + now, now) for now in (2.3, 2.4)][-1]
         assert wrong is not None and ("another servo's" in wrong[1]) is is_anothers
+
+
+@pytest.mark.parametrize(
+    ("late", "cause", "said"),
+    [
+        (3, Cause.STALE, "its replies are 3 cycles late"),
+        (4, Cause.GOALS_LOST, "receives goals 4 cycles late"),
+        (40, Cause.GOALS_LOST, "receives goals 40 cycles late"),
+        (41, Cause.GOALS_LOST, "does not hold the goals of this program"),
+    ],
+)
+def test_a_clock_that_is_right_tells_late_goals_from_late_replies(arm: Arm, late: int, cause: Cause, said: str) -> None:
+    """Cycles take 2.5 ms: the clock shows delays of more than 8 ms, and requests are late by at most 0.1 s."""
+    check = StatusCheck(arm())
+    found = []
+    for cycle in range(62):
+        goal = 0.01 * cycle
+        check.sent((goal, 0.0))
+        held = goal if cycle < 60 else 0.01 * (cycle - late)
+        now = 1.0 + 0.0025 * cycle
+        found.append(check.look(0, FINE._replace(goal=held, tick=now), goal, now))
+    assert found[:-1] == [None] * 61
+    wrong = found[-1]
+    assert wrong is not None and wrong[0] is cause and said in wrong[1]
+
+
+@pytest.mark.parametrize(("ticks", "stops"), [(0, False), (5, False), (255, True)])
+def test_while_an_arm_is_lowered_only_a_tripped_watchdog_stops(arm: Arm, ticks: int, stops: bool) -> None:
+    wrong = StatusCheck(arm(), bears_errors=True).look_at_watchdog(ticks)
+    assert (wrong is not None) is stops
