@@ -72,12 +72,12 @@ TESTS = {
     ],
     "hil/drivers/others/read_back.py": ["tests/drivers/test_sightings.py", "tests/drivers/test_read_back.py"],
     "hil/drivers/torque/switch.py": [
-        "tests/drivers/torque/test_switch.py",
-        "tests/drivers/torque/test_reports.py",
+        *("tests/drivers/torque/test_switch.py", "tests/drivers/torque/test_reports.py"),
+        "tests/drivers/test_bus.py",
     ],
     "hil/drivers/torque/off.py": [
-        "tests/drivers/torque/test_off.py",
-        "tests/drivers/torque/test_answers_again.py",
+        *("tests/drivers/torque/test_off.py", "tests/drivers/torque/test_answers_again.py"),
+        "tests/drivers/test_bus.py",
     ],
     "hil/estimator/models/standstill.py": ["tests/estimator/models/test_standstill.py"],
     "hil/experiment/chain_watch.py": [f"{_EXPERIMENT}/test_chain_watch.py"],

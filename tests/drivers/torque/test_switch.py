@@ -296,3 +296,49 @@ def test_torque_that_comes_on_while_waiting_is_cut_at_once(fake_config: Make, mo
             bus.wait_switched_off(clock.now() + 10.0)
         assert clock.now() < on_at + 0.5
         assert not any(servo.torque_enabled for servo in servos(bus).values())
+
+
+@pytest.mark.parametrize(("watchdog", "ticks"), [(0.02, 1), (2.54, 127), (0.01, None), (2.56, None)])
+def test_a_watchdog_can_be_set_to_between_20_ms_and_2_54_s(
+    fake_config: Make, watchdog: float, ticks: int | None
+) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        if ticks is None:
+            with pytest.raises(ValueError, match=r"watchdog must be 0\.02 to 2\.54 s"), bus.torque(watchdog):
+                pass
+        else:
+            with bus.torque(watchdog):
+                assert servos(bus)[1].value("Bus Watchdog") in (ticks, 255)
+        assert not any(servo.torque_enabled for servo in servos(bus).values())
+
+
+def test_torque_is_looked_at_ten_times_a_second_while_the_program_waits(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        clock, looks = bus.port.clock, []
+
+        def looking(_: Any) -> str:
+            looks.append(clock.now())
+            assert len(looks) < 50, "time does not pass"
+            return ""
+
+        monkeypatch.setattr("hil.drivers.torque.switch.switched_on", looking)
+        begun = clock.now()
+        bus.wait_switched_off(begun + 1.0)
+        assert [each - begun for each in looks] == pytest.approx([0.1 * number for number in range(11)], abs=0.005)
+
+
+def test_an_interrupt_while_another_programs_torque_is_cut_is_raised_afterwards(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ServoBus.open(fake_config()) as bus:
+
+        def interrupted(*words: Any) -> tuple[tuple[()], tuple[()]]:
+            words[-1].extend([KeyboardInterrupt("first"), KeyboardInterrupt("second")])
+            return (), ()
+
+        monkeypatch.setattr("hil.drivers.torque.switch.cut_torque", interrupted)
+        with pytest.raises(KeyboardInterrupt, match="first"):
+            bus.cut_foreign_torque(list(bus.drives))
+        monkeypatch.undo()
