@@ -38,7 +38,11 @@ TESTS = {
     ],
     "hil/experiment/command_limits.py": [f"{_EXPERIMENT}/test_command_limits.py", f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/checks/joint_checks.py": [f"{_EXPERIMENT}/test_guard.py"],
-    "hil/experiment/checks/joint_faults.py": [f"{_EXPERIMENT}/test_guard.py", f"{_EXPERIMENT}/stops"],
+    "hil/experiment/checks/joint_faults.py": [
+        f"{_EXPERIMENT}/checks/test_joint_faults.py",
+        f"{_EXPERIMENT}/test_guard.py",
+        f"{_EXPERIMENT}/stops",
+    ],
     "hil/experiment/checks/current_noise.py": [
         f"{_EXPERIMENT}/checks/test_following.py",
         f"{_EXPERIMENT}/test_guard.py",

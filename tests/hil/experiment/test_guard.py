@@ -686,6 +686,16 @@ def test_the_supply_is_blamed_only_if_it_cannot_drive_more_at_this_speed(
     assert "carries 0.120 A instead of the commanded 0.300 A" in said
 
 
+@pytest.mark.parametrize(
+    ("earlier", "volt", "is_supply"), [(9.5, 12.0, True), (12.0, nan, False), (12.0, 9.5, True), (nan, 12.0, False)]
+)
+def test_the_lowest_voltage_read_so_far_counts(arm: Arm, earlier: float, volt: float, is_supply: bool) -> None:
+    guard = Guard(arm())
+    guard.look(STILL._replace(slow=NOTHING_SLOW._replace(voltage=(earlier, earlier))))
+    stop = not_followed(guard, 0.12, 3.05, volt=volt)
+    assert (stop.cause is Cause.OUT_OF_VOLTAGE) is is_supply
+
+
 def test_another_goal_in_the_servo_is_named_before_the_supply(arm: Arm) -> None:
     said = str(not_followed(Guard(arm()), 0.12, 3.6, volt=12.0, held=0.12))
     assert "Its goal register reads 0.120 A" in said and "another program is commanding it" in said
