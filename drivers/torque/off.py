@@ -49,7 +49,8 @@ class TorqueOff:
     unwatched: confirmed or unconfirmed joints whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
     rebooted: confirmed joints whose servos were reset, which disarmed the watchdog armed before torque was switched on.
-    disarmed: confirmed joints whose servos were not reset, but whose watchdog another program switched off.
+    disarmed: confirmed joints whose watchdog is off although they hold a goal: another program switched it off, or they
+        were reset and have received goals since.
     tripped: joints whose Bus Watchdog may have tripped, which zeroes their goals; it has been cleared since.
     driven: the remaining joints, whose torque another program switches on again whenever it is cut.
     """
@@ -118,8 +119,9 @@ class TorqueOff:
                 )
             if joint in self.disarmed:
                 yield (
-                    f"{joint.title}: another program has switched off its Bus Watchdog; it was not rebooted, since it "
-                    "still holds its goal. Stop that program."
+                    f"{joint.title} holds a goal, but another program has switched off its Bus Watchdog (stop that "
+                    "program), or a brief dip of its supply rebooted it and it has received goals since (check its "
+                    "supply and its connector)."
                 )
 
     def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:

@@ -82,6 +82,7 @@ def test_a_servo_that_is_confirmed_later_is_reported_with_the_reason_of_its_sile
     assert f"{SECOND.title} did not answer at first, but answers again." in said
     assert ("was rebooted: its Bus Watchdog is no longer armed" in said) is (rebooted is True)
     assert ("another program has switched off its Bus Watchdog" in said) is (rebooted is False)
+    assert ("a brief dip of its supply rebooted it" in said) is (rebooted is False)
     assert FIRST.title not in said.partition("confirmed by reading it back.")[2]
 
 
