@@ -1,7 +1,6 @@
 """ServoBus on the fake arm in virtual time: preparation, messages, and the effect of a lost reply."""
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
@@ -11,16 +10,12 @@ from hil.drivers.joint import Joint
 from hil.drivers.packet import HardwareError
 from hil.drivers.port import Port
 from hil.drivers.servo_model import Mode, servo_model
+from tests.support.bench import servos
 
 from .conftest import JOINTS
 
 Make = Callable[..., BusConfig]
 File = Callable[..., str]
-
-
-def servos(bus: ServoBus) -> Any:
-    """Return the fake servos on the bus, by ID."""
-    return bus.port._serial.bus.servos
 
 
 def test_opened_means_ready_for_an_exchange_and_without_torque(fake_config: Make) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.config.schema import Config
+from hil.drivers.bus import ServoBus
 from hil.experiment.run import run_experiment
 from hil.fakes.servo.servo import EmulatedServo
 from hil.runs.run_folder import RunFolder
@@ -65,3 +66,10 @@ def play(config: Config, folder: Path) -> RunFolder:
     made = RunFolder.create(folder, config)
     run_experiment(config, made, config.path, lambda _: None)
     return made
+
+
+def servos(bus: ServoBus) -> dict[int, Any]:
+    """The emulated servos behind a bus, by ID."""
+    fake: Any = bus.port
+    found: dict[int, Any] = fake._serial.bus.servos
+    return found

@@ -1,9 +1,18 @@
-"""Motion before a state: a brake trusts a velocity only as far as earlier positions confirm it."""
+"""States of an arm at rest, and motion before a state: a brake trusts a velocity only as far as earlier positions
+confirm it.
+"""
 
 from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.plan.brake import Brake
 from hil.plan.recent_motion import LONG_S, RecentMotion
+
+STILL = State(0.0, 0.001, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (-1.57, 0.0), (0, 0), (False, False))
+
+
+def at(number: int, state: State) -> State:
+    """The state, in the exchange of this number at 400 Hz."""
+    return state._replace(time_before_write=number / 400, time_after_read=number / 400 + 0.001)
 
 
 def seen_moving(config: Config, state: State, interval: float | None = None) -> RecentMotion:

@@ -96,21 +96,16 @@ def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
     to a power cycle, or this is another arm's servo, on a port of the same name.
     """
     if kept.was_held and all(kept.settings.get(name) == value for name, value in kept.changed.items()):
-        lowered = {name: kept.settings[name] for name in _LOWERED if name in kept.settings}
-        wanted = {**present, **lowered}
-        return _left(kept, servo, wanted, {}, present)
-    changed = {
-        name: present[name]
-        for name, value in kept.changed.items()
-        if name in present and name in kept.settings and present[name] not in (value, kept.settings[name])
-    }
-    settings = {**present, **{name: kept.settings[name] for name in kept.changed if name in kept.settings}}
-    return _left(kept, servo, {**(settings if _MODE in changed else kept.settings), **changed}, changed, present)
-
-
-def _left(
-    kept: Kept, servo: Servo, wanted: dict[str, int], changed: dict[str, int], present: Mapping[str, int]
-) -> Left:
+        changed = {}
+        wanted = {**present, **{name: kept.settings[name] for name in _LOWERED if name in kept.settings}}
+    else:
+        changed = {
+            name: present[name]
+            for name, value in kept.changed.items()
+            if name in present and name in kept.settings and present[name] not in (value, kept.settings[name])
+        }
+        settings = {**present, **{name: kept.settings[name] for name in kept.changed if name in kept.settings}}
+        wanted = {**(settings if _MODE in changed else kept.settings), **changed}
     possible = attainable(servo, wanted)
     differing = {name: (present.get(name), value) for name, value in possible.items() if present.get(name) != value}
     return Left(kept, wanted, changed, differing)

@@ -87,7 +87,7 @@ def _restoring(kept: Kept, port: Port) -> str:
     """The command that restores a servo: `hil check` if the run's configuration still describes it on this port,
     otherwise `hil setup`.
     """
-    if kept.config and _describes(Path(kept.config), kept, port):
+    if _described(kept, port) is not None:
         return command("check", kept.config)
     baud = ["--baud", port.baud] if port.has_baud and port.baud != _USUAL_BAUD else []
     return command("setup", port.url, *baud, "--id", kept.id)
@@ -95,8 +95,8 @@ def _restoring(kept: Kept, port: Port) -> str:
 
 def _taking_over(kept: Kept, port: Port) -> str:
     """The command that lets the arm down and restores a servo; "" if the run's configuration no longer describes it."""
-    is_described = kept.config and _describes(Path(kept.config), kept, port)
-    return taking_over(load_config(Path(kept.config))) if is_described else ""
+    config = _described(kept, port)
+    return "" if config is None else taking_over(config)
 
 
 def taking_over(config: Config) -> str:
@@ -104,14 +104,18 @@ def taking_over(config: Config) -> str:
     return command("identify" if config.experiment.pilot else "record", config.path, "--take-over")
 
 
-def _describes(path: Path, kept: Kept, port: Port) -> bool:
+def _described(kept: Kept, port: Port) -> Config | None:
+    """The run's configuration if it still describes this servo on this port, otherwise None."""
+    if not kept.config:
+        return None
     try:
-        bus = load_config(path).bus
-        found = settings_file.load(bus.url, kept.id, kept.model)
+        config = load_config(Path(kept.config))
+        found = settings_file.load(config.bus.url, kept.id, kept.model)
     except (HilError, DriverError):
-        return False
-    described = {(drive.id, drive.servo.name) for joint in bus.joints for drive in joint.drives}
-    return found == kept and (kept.id, kept.model) in described and (not port.has_baud or bus.baud == port.baud)
+        return None
+    described = {(drive.id, drive.servo.name) for joint in config.bus.joints for drive in joint.drives}
+    is_same_baud = not port.has_baud or config.bus.baud == port.baud
+    return config if found == kept and (kept.id, kept.model) in described and is_same_baud else None
 
 
 def scan_with_leftovers(port: Port, bauds: Sequence[int], watch: Watch) -> Iterator[Heard]:

@@ -1,22 +1,16 @@
 """Torque that another program holds on, servos confirmed later, and faults, as a bus reports and handles them."""
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
 from hil.drivers.bus import BusConfig, ServoBus
 from hil.drivers.errors import NoReply, ServoFault, TorqueNotOff
 from hil.drivers.packet import HardwareError
+from tests.support.bench import servos
 
 Make = Callable[..., BusConfig]
 TORQUE, OPERATING_MODE, POSITION_MODE = 64, 11, 3
-
-
-def servos(bus: ServoBus) -> dict[int, Any]:
-    fake: Any = bus.port
-    found: dict[int, Any] = fake._serial.bus.servos
-    return found
 
 
 def left_silent(bus: ServoBus, servo_id: int) -> None:

@@ -12,15 +12,10 @@ from hil.drivers.bus import BusConfig, ServoBus
 from hil.drivers.errors import BusShared, ServoRefused, TorqueNotOff
 from hil.drivers.preparation.settings import put_back, read_settings
 from hil.fakes.bus.faults import Fault, FaultKind
+from tests.support.bench import servos
 
 Make = Callable[..., BusConfig]
 GOAL_CURRENT, WATCHDOG, TORQUE = 102, 98, 64
-
-
-def servos(bus: ServoBus) -> dict[int, Any]:
-    fake: Any = bus.port
-    found: dict[int, Any] = fake._serial.bus.servos
-    return found
 
 
 def fake_bus(bus: ServoBus) -> Any:

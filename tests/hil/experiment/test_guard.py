@@ -15,10 +15,10 @@ from hil.drivers.servo_model import WATCHDOG_UNIT
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
 from hil.experiment.guard import Guard
+from tests.support.motion import STILL, at
 
 Arm = Callable[..., Config]
 AT_20_HZ = ("rate = 400.0", "rate = 20.0"), ("band = [0.5, 6.0]", "band = [0.5, 4.0]")
-STILL = State(0.0, 0.001, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (-1.57, 0.0), (0, 0), (False, False))
 MISSING = STILL._replace(current=(0.0, nan), velocity=(0.0, nan), position=(-1.57, nan), missing=(False, True))
 PLANNED = 0.85, 0.85  # A: with it, 0.034 A rad may be returned
 NOTHING_SLOW = Slow((nan, nan), (nan, nan), (nan, nan))
@@ -228,11 +228,6 @@ def test_a_current_that_does_not_follow(arm: Arm) -> None:
     follows = STILL._replace(goal_current=(0.5, 0.0), current=(0.5, 0.0))
     for state in [*[off] * 11, *[follows] * 12] * 3:
         guard.look(state)
-
-
-def at(number: int, state: State) -> State:
-    """The same as sample `number` of 400 a second."""
-    return state._replace(time_before_write=number / 400, time_after_read=number / 400 + 0.001)
 
 
 def test_a_motor_that_only_takes_work_out_turns_the_wrong_way(arm: Arm) -> None:

@@ -8,14 +8,10 @@ from hil.config.schema import Config
 from hil.drivers.state import State, Status
 from hil.errors import Cause, SafetyStop
 from hil.experiment.guard import Guard
+from tests.support.motion import STILL, at
 
 Arm = Callable[..., Config]
-STILL = State(0.0, 0.001, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (-1.57, 0.0), (0, 0), (False, False))
 LACKING = STILL._replace(goal_current=(0.0, 0.3), current=(0.0, 0.1), velocity=(0.0, 4.6))
-
-
-def at(number: int, state: State) -> State:
-    return state._replace(time_before_write=number / 400, time_after_read=number / 400 + 0.001)
 
 
 def is_supplys(guard: Guard, lacking: float, *recent: State) -> bool:
