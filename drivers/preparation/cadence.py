@@ -22,6 +22,11 @@ supply current, which reveals a loss of torque only after some time.
 """
 
 
+def exchange_interval(sample: float) -> float:
+    """Return the time between two exchanges on a fast bus [s]: `sample` [s], divided so that it is at most CHECK_S."""
+    return sample / max(1, math.ceil(sample / CHECK_S - 1e-6))
+
+
 def cadence(
     sample: float, port: Port, drives: Sequence[Joint], tables: Sequence[ControlTable], return_delay: float
 ) -> tuple[int, Spans | None, int]:
@@ -37,15 +42,17 @@ def cadence(
     # worth a late sample.
     share = _MOST_SHARE if any(drive.servo.senses_supply for drive in drives) else _SHARE
     goals = 14 * len(set(modes)) + 3 * count
-    every, interval = 1, sample
+    fitting: list[tuple[float, int, Spans]] = []
     for whole in (True, False):
         span = status_span(modes, tables, whole=whole)
         taken = port.wire_time(goals + 14 + count + count * (11 + one_each(span, count)[0].size))
         taken += return_delay * count
-        if whole:
-            least = max(CHECK_S, taken / share + HOST_S)
-            every = max(1, math.floor(sample / least + 1e-6))
-            interval /= every
-        if taken < share * interval:
-            return every, span, max(1, round(STATUS_S / interval))
-    return every, None, 0
+        least = max(exchange_interval(sample), taken / share + HOST_S)
+        every = max(1, math.floor(sample / least + 1e-6))
+        if taken < share * sample / every:
+            fitting.append((sample / every, every, span))
+    if not fitting:
+        return 1, None, 0
+    # Frequent exchanges come first; if both spans allow them, the one that includes Torque Enable is read.
+    interval, every, span = min(fitting, key=lambda each: max(each[0], CHECK_S * (1 + 1e-6)))
+    return every, span, max(1, round(STATUS_S / interval))

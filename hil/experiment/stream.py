@@ -32,7 +32,6 @@ from hil.experiment.model_watch import ModelWatch
 from hil.experiment.pace import Pace
 from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
-from hil.experiment.stopping.lowering import may_lower
 from hil.experiment.stopping.way_down import Stopped, WayDown
 from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
@@ -174,7 +173,7 @@ class Stream:
             if isinstance(error, SafetyStop) and error.cause in _BY_OTHER_GOALS and self._bus.commanded_by_another:
                 error.add_note(self._bus.commanded_by_another)
                 error.overruled = True
-            if self._way_down is not None and may_lower(self._config, error):
+            if self._way_down is not None:
                 stopped = Stopped(self._state, self._whole, self._goal, self._pace.sent_at, self._segment)
                 self._way_down.lower(error, stopped)
             elif may_brake(self._config, error):

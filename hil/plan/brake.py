@@ -9,7 +9,7 @@ A joint is braked against its reported velocity only as far as the change of its
 """
 
 from hil.config.schema import Config
-from hil.drivers.preparation.cadence import CHECK_S
+from hil.drivers.preparation.cadence import exchange_interval
 from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import ExperimentError, SafetyStop
@@ -60,8 +60,7 @@ def braking_gains(config: Config, interval: float | None = None) -> list[float]:
 
     interval: time between two exchanges [s]; by default, the interval on a fast bus.
     """
-    sample = 1.0 / config.experiment.rate
-    held = (sample / max(1, int(sample / CHECK_S + 1e-6)) if interval is None else interval) + DELAY_S
+    held = (exchange_interval(1.0 / config.experiment.rate) if interval is None else interval) + DELAY_S
     return [
         min(
             joint.goal_limit / (FULL_AT * joint.velocity_limit),

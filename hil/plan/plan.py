@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hil.config.schema import Config
-from hil.drivers.bus import CHECK_S
+from hil.drivers.preparation.cadence import exchange_interval
 from hil.errors import ConfigError
 from hil.estimator.arrays import Array
 from hil.estimator.excitation.multisine import Multisine, design_multisine, detecting_lines, zippered_lines
@@ -138,7 +138,7 @@ def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) ->
         segments=tuple(segment(config, role, experiment.seed + offset) for offset, role in enumerate(roles)),
         rest_samples=max(1, round(experiment.rest * experiment.rate)),
         end_samples=_end_samples(config),
-        brake_samples=round(config.safety.damp_time / min(1 / experiment.rate, CHECK_S)),
+        brake_samples=round(config.safety.damp_time / exchange_interval(1 / experiment.rate)),
         max_settling_periods=experiment.max_settling_periods,
         periods=experiment.periods,
         settle_within=experiment.settle_within,

@@ -55,10 +55,10 @@ _FASTER = 1.3
 
 
 def may_lower(config: Config, error: BaseException) -> bool:
-    """Whether, after this error, the arm is to be lowered before torque is cut: configuration and cause must both allow
-    it.
+    """Whether, after this error, a spatial arm is to be lowered before torque is cut: configuration and cause must both
+    allow it.
     """
-    if not config.is_chain or config.safety.stop == "cut":
+    if config.safety.stop == "cut":
         return False
     if not isinstance(error, ExperimentError):
         return isinstance(error, BusOverheard)

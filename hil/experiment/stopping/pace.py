@@ -6,9 +6,11 @@ is exchanged from then on, until the end.
 
 from math import ceil
 
+from hil.plan.silence import BRIDGED_ALONE_S
+
 LONGER_S = 0.008
-"""Margin of the reply timeout [s]. It is added to the longest time that replies have taken since lowering began or, at
-first, to the timeout used during the experiment.
+"""Margin of the reply timeout of the last exchange before a silence is too long [s]. It is added to the longest time
+that replies have taken since lowering began or, at first, to the timeout used during the experiment.
 """
 
 LONGEST_S = 0.022
@@ -18,7 +20,7 @@ LAST_S = 0.075
 """Waiting always ends this long after the latest reply [s]: torque must be off 25 ms later."""
 
 MARGIN_S = 0.002
-"""Time between the end of an exchange and the next goals [s]."""
+"""Time between the end of an exchange and the next goals, and margin of the usual reply timeout [s]."""
 
 
 class Pace:
@@ -36,13 +38,16 @@ class Pace:
         self.every = 1
         """Number of samples per exchange."""
 
-    def patience(self, unheard: float, *, are_late: bool) -> float:
+    def patience(self, unheard: float, *, are_late: bool, are_damaged: bool = False) -> float:
         """How long the next exchange may wait for replies [s].
 
-        unheard: time since all servos last replied [s]. are_late: whether recent replies were too late.
+        unheard: time since all servos last replied [s]. are_late, are_damaged: whether recent replies were too late, or
+        destroyed on the way.
         """
         if not are_late and not self._was_late:
-            return self._usual
+            # Lost replies are asked for again soon; the last exchange before the limit waits for late ones.
+            is_last = not are_damaged and unheard + self._least + max(self._least, self._interval) > BRIDGED_ALONE_S
+            return self._usual if is_last else min(max(self._least, self._longest + MARGIN_S), self._usual)
         return max(min(max(self._least, LONGEST_S), LAST_S - unheard), LONGER_S)
 
     def took(self, seconds: float, *, missed: bool) -> None:

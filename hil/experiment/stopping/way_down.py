@@ -18,7 +18,7 @@ from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
 from hil.experiment.pace import read_back
 from hil.experiment.stop_request import StopRequest
-from hil.experiment.stopping.lowering import Lowering
+from hil.experiment.stopping.lowering import Lowering, may_lower
 from hil.experiment.stopping.pace import LONGER_S, Pace
 from hil.experiment.stopping.position_steps import PositionSteps
 from hil.plan.plan import Plan
@@ -26,7 +26,7 @@ from hil.plan.silence import BRIDGED_ALONE_S, BRIDGED_S
 from hil.runs.recording import Phase, Recorder, missed
 
 _RECENT_S = 0.1
-"""Time after a late reply during which further late replies are expected [s]."""
+"""Time after a late or damaged reply during which further ones are expected [s]."""
 
 
 class Stopped(NamedTuple):
@@ -82,27 +82,24 @@ class WayDown:
         self._alerts: list[bool] = []
         self._goal: list[float] = []
         self._deadline = self._sent_at = self._heard_at = 0.0
-        self._was_silent = False
+        self._was_silent = self._is_shared = False
 
     def lower(self, error: ExperimentError | BusOverheard, stopped: Stopped) -> None:
-        """Brake and lower the arm until it is at rest, a check fails, or a second signal arrives. Never raises.
+        """Brake and lower the arm, if that may be done after `error`, until it is at rest, a check fails, or a second
+        signal arrives. Never raises.
 
         error: the exception that stopped the stream; a note that says how lowering ended is added to it.
         """
         state = stopped.whole
         if state is None or stopped.latest is None or self._lowering.lies(state):
             return
+        if not may_lower(self._config, error):
+            why = 'safety.stop = "cut"' if self._config.safety.stop == "cut" else "its servos could not be relied on"
+            self._told(error, f"The arm was not lowered, so it fell: {why}.")
+            return
         self._alerts = [bool(each & ALERT) for each in stopped.latest.error]
-        if any(each & ~ALERT for each in stopped.latest.error):
-            return
-        is_alert = isinstance(error, SafetyStop) and error.cause is Cause.ALERT
-        if (is_alert or any(self._alerts)) and not self._bus.has_torque():
-            return
-        if stopped.is_blind and self._is_silent_too_long(stopped.latest, state):
-            return
-        since = 0.0 if stopped.sent_at is None else self._clock.now() - stopped.sent_at
-        if self._bus.is_watched and since >= self._config.safety.watchdog + TRIP_S:
-            self._told(error, "The arm could not be lowered: the servos' watchdogs had already tripped, so it fell.")
+        if prevented := self._why_not(error, stopped, stopped.latest, state):
+            self._told(error, f"The arm could not be lowered, so it fell: {prevented}.")
             return
         self._note(f"lowering the arm after: {error}")
         if isinstance(error, SafetyStop) and error.cause is Cause.WATCHDOG:
@@ -117,6 +114,22 @@ class WayDown:
         done = f"was lowered, but not to its rest pose: {elsewhere}" if elsewhere else "was lowered to its rest pose"
         self._told(error, f"The arm {done}.")
 
+    def _why_not(
+        self, error: ExperimentError | BusOverheard, stopped: Stopped, latest: State, whole: State
+    ) -> str | None:
+        """Say what prevents lowering, or return None."""
+        if any(each & ~ALERT for each in latest.error):
+            return "a servo answered with an error instead of its position"
+        is_alert = isinstance(error, SafetyStop) and error.cause is Cause.ALERT
+        if (is_alert or any(self._alerts)) and not self._bus.has_torque():
+            return "a servo had lost its torque"
+        if stopped.is_blind and self._is_silent_too_long(latest, whole):
+            return "replies had been missing for too long"
+        since = 0.0 if stopped.sent_at is None else self._clock.now() - stopped.sent_at
+        if self._bus.is_watched and since >= self._config.safety.watchdog + TRIP_S:
+            return "the servos' watchdogs had already tripped"
+        return None
+
     def _is_silent_too_long(self, latest: State, whole: State) -> bool:
         """Whether replies have been missing for longer than lowering can tolerate.
 
@@ -129,8 +142,12 @@ class WayDown:
         return not all(latest.missing) or (len(latest.missing) > 1 and self._bus.first_hides_others(LONGER_S))
 
     def _follow(self, state: State, stopped: Stopped) -> State:
-        """Follow the path to the rest pose; return the last state. Raises SafetyStop, StopRequested, DriverError."""
-        lowering, asked = self._lowering, max(1, self._stop.count)
+        """Follow the path to the rest pose; return the last complete state.
+
+        Raises SafetyStop, StopRequested, DriverError.
+        """
+        lowering, asked, self._whole = self._lowering, max(1, self._stop.count), state
+        self._is_shared = self._bus.prepared.heard.strangers >= 1.0
         self._bus.bear_others()
         self._bus.prepared.accept_any_order()
         self._pace = Pace(self._interval, self._bus.prepared.patience)
@@ -163,25 +180,30 @@ class WayDown:
             self._recorder.keep(self._deadline, Phase.LOWERING, stopped.segment, -1, state)
             self._look_at_alerts(state)
             lowering.look(index, state, state.time_before_write - former)
-            for checked in self._between_samples() if index + 1 < count else ():
+            for checked in self._between_samples(state) if index + 1 < count else ():
                 lowering.look(index, checked, checked.time_before_write - state.time_before_write, between=True)
                 state = checked
             index += self._pace.every
-        return state
+        return self._whole
 
     def _exchange(self, *, between: bool) -> State:
         """Exchange the latest goals with the servos, and adapt the pace to the duration of the exchange."""
         pace, former = self._pace, self._pace.every
         now = self._clock.now()
-        are_late = now - self._bus.prepared.heard.late_at < _RECENT_S
-        longer = pace.patience(now - self._heard_at, are_late=are_late) - self._bus.prepared.patience
+        heard = self._bus.prepared.heard
+        # Another master's replies look like late ones, and its packets destroy those to this program.
+        are_late = now - heard.late_at < _RECENT_S and not self._is_shared
+        are_damaged = now - heard.damaged_at < _RECENT_S or self._is_shared
+        awaited = pace.patience(now - self._heard_at, are_late=are_late, are_damaged=are_damaged)
+        longer = awaited - self._bus.prepared.patience
         if longer != 0.0:
             self._bus.prepared.wait_longer(longer)
         state = self._steps.corrected(self._bus.exchange(self._goal, between=between))
         self._sent_at = state.time_before_write
         took, is_missed = state.time_after_read - state.time_before_write, any(state.missing)
         self._takes = max(self._takes, took)
-        self._heard_at = self._heard_at if is_missed else state.time_before_write
+        if not is_missed:
+            self._whole, self._heard_at = state, state.time_before_write
         pace.took(took, missed=is_missed)
         self._look_behind_silence(state)
         if pace.every != former:
@@ -195,19 +217,25 @@ class WayDown:
             self._lowering.others_answer()
         self._was_silent = is_silent
 
-    def _between_samples(self) -> Iterator[State]:
+    def _between_samples(self, state: State) -> Iterator[State]:
         """Repeat the exchange with the same goals until the next sample is due; yield each state.
 
-        An exchange that might delay the next sample is skipped.
+        Missing replies are asked for again at once. An exchange that might delay the next sample is skipped.
         """
-        following = self._deadline + self._interval
-        for turn in range(1, self._turns if self._pace.every == 1 else 1):
-            due = self._deadline + turn * self._apart
+        following, turns = self._deadline + self._interval, self._turns if self._pace.every == 1 else 1
+        for turn in range(1, turns + 1):
+            due = following if turn == turns else self._deadline + turn * self._apart
+            while any(state.missing) and self._clock.now() + self._bus.prepared.patience < due:
+                state = self._exchange(between=True)
+                yield state
+            if turn == turns:
+                return
             self._look_for_another_master(due)
             self._clock.wait_until(due)
             now = self._clock.now()
             if now - due < self._apart and now + self._takes < following:
-                yield self._exchange(between=True)
+                state = self._exchange(between=True)
+                yield state
 
     def _look_at_alerts(self, state: State) -> None:
         """Raise SafetyStop if a servo has raised its alert since the last exchange and any servo has lost torque."""

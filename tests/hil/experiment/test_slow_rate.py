@@ -120,7 +120,7 @@ def test_a_single_long_exchange_does_not_prevent_the_next_ones(takes: list[float
     assert counted == counts
 
 
-@pytest.mark.parametrize(("rate", "count"), [(20.0, 5), (33.0, 3), (60.0, 1), (100.0, 1), (400.0, 1)])
+@pytest.mark.parametrize(("rate", "count"), [(20.0, 5), (33.0, 4), (60.0, 2), (99.0, 2), (100.0, 1), (400.0, 1)])
 def test_exchanges_per_sample(arm: Arm, rate: float, count: int) -> None:
     config = arm(("rate = 400.0", f"rate = {rate}"), ("band = [0.5, 6.0]", "band = [0.5, 4.0]"))
     fakes.register_for(config.url)

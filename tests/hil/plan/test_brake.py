@@ -23,7 +23,7 @@ def test_full_current_at_half_of_the_velocity_limit(arm: Arm) -> None:
     assert brake_of(arm(), MOVING).goals(MOVING) == pytest.approx([-1.2 * 3.0 / 7.5, 0.8 * 4.0 / 10.0])
 
 
-@pytest.mark.parametrize(("rate", "interval"), [(100.0, 0.01), (60.0, 1 / 60), (20.0, 0.01), (40.0, 0.025)])
+@pytest.mark.parametrize(("rate", "interval"), [(100.0, 0.01), (60.0, 1 / 120), (20.0, 0.01), (40.0, 0.025)])
 def test_a_light_joint_is_not_thrown_back(arm: Arm, rate: float, interval: float) -> None:
     """With a velocity limit of 0.2 rad/s, the full current at half of it would reverse a light joint at once.
 

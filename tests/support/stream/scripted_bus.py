@@ -34,6 +34,9 @@ class Bus:
         self.watchdog_changed: tuple[int, int] | None = None
         self.torque_lost: int | None = None
         self.takes = takes
+        self.unanswered: list[int] = []
+        """Numbers of the exchanges to which the second servo does not reply, counted from the first."""
+        self.exchanges = 0
         self.calls: list[Call] = []
         self.velocity = NOTHING
         self.moves_every = 1
@@ -42,7 +45,7 @@ class Bus:
         """Difference of two successive positions [rad]."""
         self.keeps_torque = True
         self.first_hides = False
-        self.heard = SimpleNamespace(late_at=-math.inf)
+        self.heard = SimpleNamespace(late_at=-math.inf, damaged_at=-math.inf, strangers=0.0)
         self.error = (0,) * JOINTS
         self.slow: Slow | None = None
         self.status: Any = None
@@ -67,10 +70,12 @@ class Bus:
         now = self.clock.now()
         self.calls.append(("between" if between else "sample", round(now, 6), *goals))
         self.clock.wait_until(now + (self.takes.pop(0) if len(self.takes) > 1 else self.takes[0]))
-        position, fine = (HELD + self.wobble * (len(self.calls) % 2),) * JOINTS, (False,) * JOINTS
+        missing = (False, self.exchanges in self.unanswered)
+        self.exchanges += 1
+        position = tuple(math.nan if each else HELD + self.wobble * (len(self.calls) % 2) for each in missing)
         after, sent = self.clock.now(), tuple(goals)
         velocity = NOTHING if len(self.calls) % self.moves_every else self.velocity
-        return State(now, after, sent, sent, velocity, position, self.error, fine, self.slow, self.status)
+        return State(now, after, sent, sent, velocity, position, self.error, missing, self.slow, self.status)
 
     def read_torque(self) -> int | None:
         return self.torque_lost

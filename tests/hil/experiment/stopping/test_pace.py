@@ -19,12 +19,27 @@ def test_exchanges_are_as_far_apart_as_the_replies_are_late(late: float, rate: i
 
 def test_late_replies_are_awaited_longer_but_not_for_ever() -> None:
     pace = Pace(0.01, 0.005)
-    assert pace.patience(0.02, are_late=False) == pytest.approx(0.005 + LONGER_S), "lost ones are asked for again soon"
     assert pace.patience(0.02, are_late=True) == LONGEST_S
     assert pace.patience(LAST_S - 0.015, are_late=True) == pytest.approx(0.015)
     assert pace.patience(LAST_S, are_late=True) == pytest.approx(LONGER_S)
     pace.took(0.003, missed=False)
-    assert pace.patience(0.0, are_late=False) == pytest.approx(0.003 + LONGER_S) and pace.every == 1
+    assert pace.patience(0.02, are_late=False) == pytest.approx(0.003 + LONGER_S) and pace.every == 1
+
+
+@pytest.mark.parametrize(("rate", "lasts"), [(400, 0.022), (250, 0.021), (133, 0.01748), (100, 0.015), (20, -1.0)])
+def test_lost_replies_are_asked_for_again_soon_unless_no_time_is_left(rate: int, lasts: float) -> None:
+    """The last exchange before the limit of 28 ms waits longer: the replies may only be late."""
+    pace = Pace(1 / rate, 0.003)
+    for unheard in (0.0, 0.0149, 0.0151, 0.0174, 0.0176, 0.0209, 0.0211, 0.0219, 0.0221, 0.05):
+        expected = 0.003 + (LONGER_S if unheard > lasts else 0.0)
+        assert pace.patience(unheard, are_late=False) == pytest.approx(expected), unheard
+        assert pace.patience(unheard, are_late=False, are_damaged=True) == pytest.approx(0.003), "lost, not late"
+
+
+def test_replies_that_have_taken_longer_are_awaited_as_long() -> None:
+    pace = Pace(0.02, 0.003)
+    pace.took(0.006, missed=False)
+    assert pace.patience(0.0, are_late=False) == pytest.approx(0.008)
 
 
 def test_what_an_unknown_adapter_might_take_is_not_awaited_once_it_is_known_to_be_fast() -> None:

@@ -46,8 +46,8 @@ class Lowers(Checks):
     def look(self, index: int, _state: State, gap: float, *, between: bool = False) -> None:  # type: ignore[override]
         self.calls.append(("look", index, round(gap, 6), between))
 
-    def lies_elsewhere(self, _state: State) -> str:
-        return self.elsewhere
+    def lies_elsewhere(self, state: State) -> str:
+        return self.elsewhere if all(map(math.isfinite, state.position)) else "at nan"
 
 
 class Made:
@@ -144,7 +144,7 @@ def test_an_arm_whose_watchdogs_have_acted_cannot_be_lowered(
     made.bus.is_watched = is_watched
     made.bus.clock.wait_until(0.05 + since)
     (told,) = made.lower()
-    assert ("was lowered" in told) is is_lowered and ("had already tripped" in told) is not is_lowered
+    assert ("was lowered" in told) is is_lowered and ("fell: the servos' watchdogs had" in told) is not is_lowered
     assert len(made.bus.times("sample")) == (3 if is_lowered else 0)
 
 
@@ -167,7 +167,8 @@ def test_an_arm_is_lowered_without_replies_only_from_where_it_was_just_seen(
     state = made.stopped.whole
     assert state is not None
     made.bus.clock.wait_until(state.time_before_write + silent)
-    assert bool(made.lower(latest=state._replace(missing=missing))) is is_lowered
+    (told,) = made.lower(latest=state._replace(missing=missing))
+    assert ("was lowered" in told) is is_lowered and ("it fell: replies had been missing" in told) is not is_lowered
     assert is_lowered or not made.bus.times("sample")
 
 
@@ -178,8 +179,26 @@ def test_an_arm_that_lies_or_was_not_seen_is_not_lowered(make: Make) -> None:
     assert made.lower() == []
     made.lowering.lies_already = False
     assert made.stopped.latest is not None
-    assert made.lower(latest=made.stopped.latest._replace(error=(4, 0))) == [] and not made.bus.calls
+    (told,) = made.lower(latest=made.stopped.latest._replace(error=(4, 0)))
+    assert "it fell: a servo answered with an error" in told and not made.bus.calls
     assert made.lower(sent_at=None) == ["The arm was lowered to its rest pose."]
+
+
+@pytest.mark.parametrize(
+    ("stop", "cause", "why"),
+    [
+        ("cut", Cause.TEMPERATURE, 'it fell: safety.stop = "cut"'),
+        ("damp", Cause.WRONG_SIGN, "it fell: its servos could not be relied on"),
+    ],
+)
+def test_an_arm_that_must_not_be_lowered_is_said_to_have_fallen(make: Make, stop: str, cause: Cause, why: str) -> None:
+    made = make()
+    config = made.way._config
+    made.way._config = config.model_copy(update={"safety": config.safety.model_copy(update={"stop": stop})})
+    error = SafetyStop("stopped", cause)
+    made.way.lower(error, made.stopped)
+    (told,) = error.__notes__
+    assert why in told and not made.bus.calls
 
 
 @pytest.mark.parametrize(("count", "asked"), [(0, 1), (1, 1), (2, 2)])
@@ -209,12 +228,49 @@ def test_an_alert_drops_the_arm_only_with_lost_torque(make: Make, keeps_torque: 
     made.bus.keeps_torque = keeps_torque
     alert = SafetyStop("stopped", Cause.ALERT)
     made.way.lower(alert, made.stopped)
+    (told,) = alert.__notes__
+    assert ("it fell: a servo had lost its torque" in told) is not keeps_torque
     assert len(made.bus.times("sample")) == (3 if keeps_torque else 0)
     made = make()
     made.bus.keeps_torque, made.bus.error = keeps_torque, (0, 128)
     (told,) = made.lower()
     assert ("was lowered" in told) is keeps_torque and ("lost its torque" in told) is not keeps_torque
     assert len(made.bus.times("sample")) == (3 if keeps_torque else 1) and made.bus.calls.count(("torque",)) == 1
+
+
+def test_missing_replies_are_asked_for_again_at_once(make: Make) -> None:
+    """While there is time before the next sample, and not again once they have come."""
+    made = make(takes=[TAKES_S, 0.005, 0.005, TAKES_S])
+    made.bus.patience = 0.005
+    made.bus.unanswered = [2, 3]
+    made.lower()
+    first = 0.05 + TAKES_S
+    assert made.bus.times("sample") == pytest.approx([first, first + 0.05, first + 0.1])
+    assert made.bus.times("between") == pytest.approx([first + 0.055, first + 0.06])
+    made = make(takes=[TAKES_S, 0.045, 0.045, TAKES_S])
+    made.bus.patience, made.bus.unanswered = 0.045, [2, 3]
+    made.lower()
+    assert made.bus.times("between") == [], "they would delay the next sample"
+
+
+def test_a_reply_that_is_missing_at_the_end_leaves_the_last_known_pose(make: Make) -> None:
+    made = make()
+    made.bus.unanswered = [3]
+    assert made.lower() == ["The arm was lowered to its rest pose."]
+
+
+@pytest.mark.parametrize(
+    ("strangers", "late", "awaited"), [(1.0, True, 0.003), (0.0, True, 0.022), (0.0, False, 0.009)]
+)
+def test_replies_that_another_master_destroys_are_not_awaited_longer(
+    make: Make, strangers: float, late: bool, awaited: float
+) -> None:
+    """Its own replies look like late ones."""
+    made = make()
+    made.bus.patience = 0.003
+    made.bus.heard.strangers, made.bus.heard.late_at = strangers, 10.0 if late else -math.inf
+    made.lower()
+    assert made.bus.patience == pytest.approx(awaited)
 
 
 def test_packets_of_another_master_do_not_end_the_lowering(make: Make) -> None:

@@ -464,14 +464,13 @@ def test_balancing_ends_once_the_arm_is_balanced_and_still_or_its_time_is_up(
 
 
 @pytest.mark.parametrize(
-    ("can_be_lowered", "may_lower", "may_brake", "does"),
-    [(True, True, True, "lower"), (False, True, True, "brake"), (True, False, True, "brake"), (True, False, False, "")],
+    ("can_be_lowered", "may_brake", "does"),
+    [(True, True, "lower"), (False, True, "brake"), (True, False, "lower"), (False, False, "")],
 )
 def test_a_stopped_arm_is_lowered_or_braked_or_neither(
-    make: Make, monkeypatch: pytest.MonkeyPatch, can_be_lowered: bool, may_lower: bool, may_brake: bool, does: str
+    make: Make, monkeypatch: pytest.MonkeyPatch, can_be_lowered: bool, may_brake: bool, does: str
 ) -> None:
     stream, _, _ = make()
-    monkeypatch.setattr(module, "may_lower", lambda *_: may_lower)
     monkeypatch.setattr(module, "may_brake", lambda *_: may_brake)
     done: list[str] = []
     way_down: Any = SimpleNamespace(lower=lambda *_: done.append("lower"))
