@@ -187,10 +187,13 @@ class Servo:
         self._try(f"writing {value} to {register}", send, attempts)
 
     def let_answer(self) -> None:
-        """Set Status Return Level to 2 if the servo answers pings, which it does even at level 0. Raises the errors of
-        `ping`.
+        """Set Status Return Level to 2 if the servo answers pings but not reads, as at level 0. Raises the errors of
+        `ping` and `read`.
         """
         self.ping(attempts=1)
+        with suppress(NoReply):
+            self.read("Status Return Level", attempts=2)
+            return  # it was silent for another reason, for example because it was booting
         with suppress(NoReply):
             self.write_only("Status Return Level", 2, attempts=1)
         self.answered_pings_only = True

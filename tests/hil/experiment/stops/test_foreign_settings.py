@@ -167,6 +167,18 @@ def test_a_servo_that_was_told_to_answer_pings_only_is_named_and_confirmed_off(
     assert ports[0].bus.servos[1].value("Status Return Level") == 2
 
 
+@pytest.mark.parametrize("boots_in", [0.05, 0.2, 0.217, 0.224, 0.231, 0.25])
+def test_a_servo_that_boots_while_torque_is_cut_is_not_said_to_have_other_settings(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, boots_in: float
+) -> None:
+    """It does not answer the read, but then it answers the ping."""
+    reboots = once(lambda: fault(ports, FaultKind.REBOOT, servo=1, amount=boots_in))
+    stop, _ = run_until_stopped(arm(), tmp_path / "run", reboots, plan)
+    said = " ".join([str(stop), *stop.__notes__])
+    assert "Status Return Level" not in said and "was rebooted" in said
+    assert_stopped(ports[0])
+
+
 @pytest.mark.parametrize("ago", [0.02, 0.2])
 def test_a_mode_that_may_have_changed_after_a_stop_at_a_limit_is_not_said_to_be_its_cause(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch, ago: float
