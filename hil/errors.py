@@ -22,9 +22,11 @@ hil.drivers.errors.DriverError  1   communication with the servos
 hil.estimator.errors.EstimationError  1   the recording does not determine the parameters
 """
 
+import errno
 import re
 import signal
 from enum import Enum
+from pathlib import Path
 
 __all__ = [
     "Cause",
@@ -122,6 +124,21 @@ class RunFolderError(HilError):
     """The run folder cannot be used. Example: `--out` names a folder that holds another run."""
 
     exit_code = 2
+
+
+_NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+
+
+def not_written(path: Path, error: OSError, what: str = "") -> RunFolderError:
+    """Return the error to raise if a file or folder cannot be written, with advice if there is no space for it.
+
+    what: what to call it at the beginning of the message, such as "Run folder".
+    """
+    advice = " Free some space (or raise the limit on file sizes), or choose another disk."
+    said = f"{what} {path}".strip()
+    return RunFolderError(
+        f"{said} cannot be written: {error.strerror or error}.{advice if error.errno in _NO_SPACE else ''}"
+    )
 
 
 class SchedulerLost(HilError):

@@ -3,7 +3,7 @@
 from contextlib import suppress
 from pathlib import Path
 
-from hil.errors import RunFolderError
+from hil.errors import RunFolderError, not_written
 
 __all__ = ["replace_file", "write_whole"]
 
@@ -23,7 +23,7 @@ def write_whole(path: Path, text: str) -> None:
                 stream.write(text)
             return
     except OSError as error:
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+        raise not_written(path, error) from error
     replace_file(target, text)
 
 
@@ -36,4 +36,4 @@ def replace_file(path: Path, text: str) -> None:
     except OSError as error:
         with suppress(OSError):
             temporary.unlink()
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+        raise not_written(path, error) from error

@@ -124,8 +124,8 @@ def record(
     with _discarding(run, "record", shown):
         _tell_doubts(checked, tell)
         torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))
-    tell(Progress("experiment", torque))
-    return load_run(run.path)
+        tell(Progress("experiment", torque))
+        return load_run(run.path)
 
 
 def _earlier(config: Config, shown: Path, path: Path) -> Result:

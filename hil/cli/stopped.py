@@ -5,6 +5,7 @@ While an arm may move, hil.experiment.stop_request handles these signals; the ex
 """
 
 import _thread
+import errno
 import signal
 import sys
 import threading
@@ -16,6 +17,9 @@ from typing import Any
 import typer
 
 from hil.next_step import next_step
+
+_CLOSED = frozenset({errno.EIO, errno.EPIPE})
+"""Errors of a terminal that has been closed."""
 
 _LOADERS, _LATER_S = frozenset({"importlib", "_frozen_importlib", "numba", "llvmlite"}), 0.02
 """Packages whose code a signal must not interrupt: a signal that arrives there is sent again after this time [s]."""
@@ -35,7 +39,9 @@ def stopped_by_signals() -> Iterator[None]:
     former = _catch() if threading.current_thread() is threading.main_thread() else {}
     try:
         yield
-    except KeyboardInterrupt as stopped:
+    except (KeyboardInterrupt, OSError) as raised:
+        if (stopped := _interruption(raised)) is None:
+            raise
         number = stopped.number if isinstance(stopped, Terminated) else signal.SIGINT
         name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
         with suppress(OSError):  # a closed terminal
@@ -44,6 +50,19 @@ def stopped_by_signals() -> Iterator[None]:
     finally:
         for each, handler in former.items():
             signal.signal(each, handler)
+
+
+def _interruption(raised: BaseException) -> KeyboardInterrupt | None:
+    """Return the interruption that was raised or that was being handled when `raised` was; None if there was none.
+
+    A terminal that is closed sends SIGHUP and then rejects all output, for example the end of a progress bar.
+    """
+    seen: BaseException | None = raised
+    if isinstance(raised, OSError) and raised.errno not in _CLOSED:
+        return None
+    while seen is not None and not isinstance(seen, KeyboardInterrupt):
+        seen = seen.__context__
+    return seen
 
 
 def how_to_go_on(stopped: BaseException) -> list[str]:

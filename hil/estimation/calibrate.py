@@ -10,6 +10,7 @@ from hil.errors import ConfigError
 from hil.estimation.chain_calibrate import calibrate_chain_runs, link_of
 from hil.estimation.model_from_config import voltage_driven, wanted_model
 from hil.estimation.settled_period import settled_period
+from hil.estimator.arrays import Array
 from hil.estimator.calibration import Calibration, KnownMass, calibrate
 from hil.estimator.chain.calibration import ChainCalibration, MassOnLink
 from hil.estimator.identify import identify
@@ -20,6 +21,16 @@ from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 
 SCHEMA = 1
+
+_CONTRADICTORY = 4.0
+"""The runs contradict the mass if the joint fit's residual exceeds one step and, by this factor, that of a fit to the
+run without the mass alone. For spatial arms, the factor applies to the residual relative to the noise.
+"""
+
+_IMPLAUSIBLE = 3.0
+"""Ratio of an identified to the assumed torque constant, or its inverse, that cannot be due to the servo: published
+values differ by a third. Without the mass, the two runs are alike, which an arm with endless torque would explain.
+"""
 
 
 @dataclass(frozen=True)
@@ -45,25 +56,30 @@ class CalibrationFit:
     """Quality of the fit.
 
     residual_rms_ticks: RMS residual of both runs [encoder steps]. misfit: weighted sum of squared residuals per sample;
-    1 means noise alone. joints: number of joints. reached: whether the fit has reached its minimum.
+    1 means noise alone. joints: number of joints. reached: whether the fit has reached its minimum. alone_rms_ticks:
+    RMS residual of a fit to the run without the mass alone [encoder steps]; None for spatial arms.
     """
 
     residual_rms_ticks: tuple[PerJoint, ...]
     misfit: float
     joints: int
     reached: bool = True
+    alone_rms_ticks: PerJoint | None = None
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
     """The result of `hil calibrate`: torque constants by joint name, and the arm's parameters estimated along with
     them.
+
+    contradictory: whether the two runs do not differ as those of an arm without and with this mass would.
     """
 
     schema: int
     torque_per_goal: Mapping[str, TorqueConstant]
     parameters: Mapping[str, Estimated]
     fit: CalibrationFit
+    contradictory: bool
 
 
 @dataclass(frozen=True)
@@ -114,7 +130,8 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, added: AddedMass) -
     model = wanted_model(config.model, len(config.joints), voltage_driven(config)).without("torque_scale")
     first = identify(periods[0], model)
     found = calibrate(periods[0], periods[1], first, known, config.arm.gravity)
-    return _described(config, found)
+    alone = np.sqrt(np.nanmean(np.square(first.residual), axis=1)) / periods[0].position_step
+    return _described(config, found, tuple(alone.tolist()))
 
 
 def _same_arm(config: Config, other: Config) -> None:
@@ -140,9 +157,22 @@ def _constants(config: Config, factor: list[float], std: list[float]) -> dict[st
     }
 
 
+def _contradicts(fit: CalibrationFit, factor: Array) -> bool:
+    if np.any(np.abs(np.log(factor)) > np.log(_IMPLAUSIBLE)):
+        return True
+    if fit.alone_rms_ticks is None:
+        return fit.misfit > _CONTRADICTORY**2
+    return float(np.max(fit.residual_rms_ticks)) > max(1.0, _CONTRADICTORY * max(fit.alone_rms_ticks))
+
+
 def _described_chain(config: Config, found: ChainCalibration) -> CalibrationResult:
     names = found.estimate.model.linear_names
-    steps = found.residual_steps
+    fit = CalibrationFit(
+        residual_rms_ticks=tuple(map(tuple, found.residual_steps.tolist())),
+        misfit=found.misfit,
+        joints=len(config.joints),
+        reached=found.estimate.reached,
+    )
     return CalibrationResult(
         schema=SCHEMA,
         torque_per_goal=_constants(config, found.factor.tolist(), found.factor_std.tolist()),
@@ -150,16 +180,18 @@ def _described_chain(config: Config, found: ChainCalibration) -> CalibrationResu
             name: Estimated(float(value), float(error))
             for name, value, error in zip(names, found.value, found.std, strict=True)
         },
-        fit=CalibrationFit(
-            residual_rms_ticks=tuple(map(tuple, steps.tolist())),
-            misfit=found.misfit,
-            joints=len(config.joints),
-            reached=found.estimate.reached,
-        ),
+        fit=fit,
+        contradictory=_contradicts(fit, found.factor),
     )
 
 
-def _described(config: Config, found: Calibration) -> CalibrationResult:
+def _described(config: Config, found: Calibration, alone: PerJoint) -> CalibrationResult:
+    fit = CalibrationFit(
+        residual_rms_ticks=tuple(map(tuple, found.residual_steps.tolist())),
+        misfit=found.misfit,
+        joints=len(config.joints),
+        alone_rms_ticks=alone,
+    )
     return CalibrationResult(
         schema=SCHEMA,
         torque_per_goal=_constants(config, found.factor.tolist(), found.factor_std.tolist()),
@@ -167,11 +199,8 @@ def _described(config: Config, found: Calibration) -> CalibrationResult:
             name: Estimated(float(value), float(error))
             for name, value, error in zip(found.names, found.value, found.std, strict=True)
         },
-        fit=CalibrationFit(
-            residual_rms_ticks=tuple(map(tuple, found.residual_steps.tolist())),
-            misfit=found.misfit,
-            joints=len(config.joints),
-        ),
+        fit=fit,
+        contradictory=_contradicts(fit, found.factor),
     )
 
 
@@ -190,6 +219,13 @@ def calibration_lines(result: CalibrationResult) -> list[str]:
             "The fit stopped short of its minimum; the standard errors include the remaining distance to the minimum. "
             "Record both runs again before relying on these values, with faster motion if a joint sticks."
         )
+    if result.contradictory:
+        lines.append(
+            "Do not use these values: the two runs do not differ as this mass would make them differ. Check that the "
+            "mass was bolted on in the second run only, that the folders are given in this order, and the mass, its "
+            "position and the length of link 1; then record both runs again."
+        )
+        return lines
     lines.append("The standard errors cover noise only: add the relative errors of the mass and of its distance.")
     lines.append("Set torque_constant (torque_per_volt in pwm mode) of each joint to these values and estimate again.")
     return lines

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hil import __version__
-from hil.errors import RunFolderError
+from hil.errors import not_written
 from hil.estimator.arrays import Array
 from hil.export.columns import COLUMN_UNITS
 from hil.export.foxglove import (
@@ -52,7 +52,7 @@ def export_mcap(source: Recorded, path: Path) -> list[str]:
             _write(writer, source)
             writer.finish()
     except OSError as error:
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+        raise not_written(path, error) from error
     return []
 
 

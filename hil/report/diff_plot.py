@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hil.errors import MissingExtra, RunFolderError
+from hil.errors import MissingExtra, RunFolderError, not_written
 from hil.estimation.changes.diff import Change, Difference
 
 _SHOWN_PERCENT = 100.0
@@ -30,7 +30,7 @@ def save_diff_plot(difference: Difference, path: Path) -> None:
     try:
         figure.savefig(path, dpi=150)
     except OSError as error:
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+        raise not_written(path, error) from error
     except ValueError as error:  # an extension that matplotlib does not know
         raise RunFolderError(f"{path} cannot be written: {error}.") from error
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from hil.errors import RunFolderError
+from hil.errors import not_written
 from hil.report.chart import Figure
 from hil.report.page import figures_in, sections
 from hil.report.png import save_png
@@ -26,7 +26,7 @@ def save_pictures(shown: Sequence[Figure], folder: Path, kind: str) -> list[Path
                 path.write_text(draw_svg(figure, WIDE), encoding="utf-8")
             saved.append(path)
     except OSError as error:
-        raise RunFolderError(f"{folder} cannot be written: {error.strerror}.") from error
+        raise not_written(folder, error) from error
     return saved
 
 

@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from hil.errors import RunFolderError
+from hil.errors import RunFolderError, not_written
 from hil.estimator.arrays import Array
 from hil.estimator.data.relative_error import relative_error
 from hil.runs.file_size import check_archive
@@ -58,7 +58,7 @@ def save_periods(run: Path, periods: Mapping[str, PlayedPeriod]) -> None:
         np.savez(temporary, allow_pickle=False, **arrays, **rates)
         temporary.replace(path)
     except OSError as error:
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+        raise not_written(path, error) from error
 
 
 def load_periods(run: Path) -> dict[str, PlayedPeriod]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.drivers.state import State
-from hil.errors import RunFolderError
+from hil.errors import RunFolderError, not_written
 from hil.runs.background import Background
 from hil.runs.file_size import check_array
 
@@ -94,7 +94,7 @@ class Recorder:
         except OSError as error:
             with contextlib.suppress(OSError):
                 path.unlink()  # a part of it could not be reserved
-            raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+            raise not_written(path, error) from error
         self._bytes = memoryview(self._samples.view(np.uint8).data)
         self._rows_a_chunk = max(1, _CHUNK_BYTES // self._row.size)
         self._touched = Background(self._touch, 4)

@@ -19,7 +19,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from hil import __version__
-from hil.errors import RunFolderError
+from hil.errors import RunFolderError, not_written
 from hil.estimator.arrays import Array
 from hil.results.json_form import FormError, from_json, to_json
 from hil.runs.file_size import check_archive
@@ -96,7 +96,7 @@ def create(path: Path) -> None:
         if any(path.iterdir()):
             raise taken(path)
     except OSError as error:
-        raise RunFolderError(f"Run folder {path} cannot be written: {error.strerror}.") from error
+        raise not_written(path, error, "Run folder") from error
 
 
 def save(path: Path, record: RecordingRecord, config: str, recordings: Sequence[Predicted]) -> None:
@@ -110,7 +110,7 @@ def save(path: Path, record: RecordingRecord, config: str, recordings: Sequence[
         np.savez_compressed(path / ARRAYS, names=np.array([each.name for each in recordings]), **arrays)
         (path / "config.toml").write_text(config, encoding="utf-8")
     except OSError as error:
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+        raise not_written(path, error) from error
     write_json(path / "run.json", {"schema": SCHEMA, **to_json(record)})
 
 

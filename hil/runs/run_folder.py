@@ -35,7 +35,7 @@ from hil.config.chain import described_arm
 from hil.config.experiment import ExperimentConfig
 from hil.config.schema import ArmConfig, Config, StabiliserConfig, parse_config
 from hil.description.kept_file import kept_bytes
-from hil.errors import ConfigError, RunFolderError
+from hil.errors import ConfigError, RunFolderError, not_written
 from hil.next_step import command, only_steps, steps_of
 from hil.plan.plan import Plan
 from hil.results.json_form import FormError, from_json, to_json
@@ -140,7 +140,7 @@ class RunFolder:
                 keep_shapes(described_arm(config), path)
             run._written += path.iterdir()
         except OSError as error:
-            raise RunFolderError(f"Run folder {path} cannot be written: {error.strerror}.") from error
+            raise not_written(path, error, "Run folder") from error
         return run
 
     def refuse_lost(self) -> None:
@@ -300,7 +300,7 @@ class RunFolder:
                 if path.is_file():
                     path.replace(folder.path / path.name)
         except OSError as error:
-            raise RunFolderError(f"{folder.path} cannot be written: {error.strerror}.") from error
+            raise not_written(folder.path, error) from error
 
     def write_facts(self, facts: RunFacts, plan: Plan) -> None:
         """Write run.json: `facts`, versions and machine."""
@@ -350,7 +350,7 @@ class RunFolder:
             with path.open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
         except OSError as error:
-            raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+            raise not_written(path, error) from error
 
     def load_events(self) -> tuple[tuple[float, str], ...]:
         """The events as (time on the port's clock [s], what happened); a last line cut short by a crash is ignored.

@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hil.errors import RunFolderError
+from hil.errors import RunFolderError, not_written
 from hil.study.work import Row
 
 _PART = "part-*.parquet"
@@ -38,7 +38,7 @@ class Dataset:
             pq.write_table(_table(rows), temporary)
             temporary.replace(path)
         except OSError as error:
-            raise RunFolderError(f"{path} cannot be written: {error.strerror or error}.") from error
+            raise not_written(path, error) from error
         self._next += 1
 
     def done(self) -> set[int]:

@@ -15,7 +15,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from hil.errors import ConfigError, RunFolderError
+from hil.errors import ConfigError, RunFolderError, not_written
 from hil.runs.run_folder import write_json
 from hil.study.dataset import Dataset
 from hil.study.draw import arm_path, recordings
@@ -38,7 +38,7 @@ def opened(study: Study, out: Path, runs: int, *, resume: bool) -> Iterator[Data
         (out / "rows").mkdir(parents=True, exist_ok=True)
         lock = os.open(out / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
     except OSError as error:
-        raise RunFolderError(f"{out} cannot be written: {error.strerror}.") from error
+        raise not_written(out, error) from error
     try:
         _hold(lock, out)
         if copy.is_file():
@@ -54,7 +54,7 @@ def opened(study: Study, out: Path, runs: int, *, resume: bool) -> Iterator[Data
         try:
             copy.write_bytes(text)
         except OSError as error:
-            raise RunFolderError(f"{out} cannot be written: {error.strerror}.") from error
+            raise not_written(out, error) from error
         write_json(about, now)
         dataset = Dataset(out / "rows")
         try:

@@ -18,7 +18,7 @@ from pathlib import Path
 from hil.description.regular_file import not_a_file
 from hil.drivers.adapter.device import adapter_name
 from hil.drivers.errors import WrongSetting
-from hil.errors import RunFolderError
+from hil.errors import not_written
 
 SCHEMA = 1
 COPY_NAME = "servo_settings.json"
@@ -213,7 +213,7 @@ def write_durably(path: Path, value: object) -> None:
         except FileNotFoundError:
             _write(path, value)
     except OSError as error:
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+        raise not_written(path, error) from error
 
 
 def _write(path: Path, value: object) -> None:

@@ -139,6 +139,22 @@ def test_a_disk_that_fills_up_after_the_experiment_leaves_a_command(tmp_path: Pa
     assert ended.value.__notes__ == ["The result is kept; the report is missing.", f"Next: hil report {tmp_path}"]
 
 
+def test_a_stop_after_a_complete_recording_names_the_estimate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run folder is not empty: the same command would be refused."""
+
+    def stopped(_: Path) -> None:
+        raise KeyboardInterrupt
+
+    (tmp_path / "arm.toml").write_bytes((CONFIGS / "fake_two_link_ideal.toml").read_bytes())
+    monkeypatch.setattr(experiment, "run_experiment", lambda *_: "Torque is off.")
+    monkeypatch.setattr(RunFolder, "discard_if_unused", lambda _: False)
+    monkeypatch.setattr(experiment, "load_run", stopped)
+    monkeypatch.setattr(experiment, "after_a_stop", lambda run, *_: [f"Next: hil estimate {run.path}"])
+    with pytest.raises(KeyboardInterrupt) as ended:
+        experiment.record(tmp_path / "arm.toml", out=tmp_path / "run")
+    assert ended.value.__notes__ == [f"Next: hil estimate {tmp_path / 'run'}"]
+
+
 @pytest.mark.parametrize(
     ("note", "command"),
     [

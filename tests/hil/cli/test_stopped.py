@@ -1,5 +1,6 @@
 """A signal while no arm moves ends the command, but never in the middle of loading a module."""
 
+import errno
 import importlib
 import signal
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from hil.cli.stopped import stopped_by_signals
+from hil.cli.stopped import Terminated, stopped_by_signals
 
 SIGNALS_ITSELF = """
 import signal
@@ -32,3 +33,20 @@ def test_a_signal_while_a_module_is_loaded_waits_until_it_is_complete(
         time.sleep(5.0)
     assert ended.value.exit_code == 128 + signal.Signals[name] and sys.modules[module].loaded
     assert f"hil: Stopped by {said}." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("number", "ends"), [(errno.EIO, typer.Exit), (errno.ENOSPC, OSError)])
+def test_a_terminal_that_is_closed_ends_the_command_as_its_signal_does(number: int, ends: type[Exception]) -> None:
+    """Its progress bar can no longer be drawn; an error that has another cause is not hidden."""
+    with pytest.raises(ends) as ended, stopped_by_signals():
+        try:
+            raise Terminated(signal.SIGHUP)
+        finally:
+            raise OSError(number, "the bar")
+    if isinstance(ended.value, typer.Exit):
+        assert ended.value.exit_code == 128 + signal.SIGHUP
+
+
+def test_an_error_of_the_terminal_without_a_signal_is_passed_on() -> None:
+    with pytest.raises(OSError, match="the bar"), stopped_by_signals():
+        raise OSError(errno.EIO, "the bar")

@@ -229,5 +229,12 @@ def test_a_known_mass_mends_a_torque_constant(arm_file: ArmFile, capsys: pytest.
     found = json.loads(capsys.readouterr().out)["torque_per_goal"]
     assert found["shoulder"]["value"] == pytest.approx(1.8, rel=0.01)
     assert found["elbow"]["value"] == pytest.approx(1.8, rel=0.01)
+    assert hil(*asked) == 0
+    assert "Set torque_constant" in (said := capsys.readouterr().out) and "Do not use" not in said
     assert hil(*asked[:-2]) == 1
     assert "--length" in capsys.readouterr().err
+    assert hil("record", arm_file(*wrong, ("seed = 1", "seed = 2")), "--out", "bare_again") == 0
+    capsys.readouterr()
+    for runs in (("bare", "bare_again"), ("with_mass", "bare")):
+        assert hil("calibrate", *runs, *asked[3:]) == 0
+        assert "Do not use these values" in (said := capsys.readouterr().out) and "Set torque_constant" not in said

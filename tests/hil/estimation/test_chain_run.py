@@ -338,10 +338,12 @@ def test_too_little_torque_for_the_path_is_named() -> None:
 
 def test_an_unfinished_calibration_says_so() -> None:
     fit = CalibrationFit(residual_rms_ticks=((0.29,), (0.29,)), misfit=1.0, joints=1)
-    result = CalibrationResult(1, {}, {}, fit)
+    result = CalibrationResult(1, {}, {}, fit, contradictory=False)
     said = [" ".join(calibration_lines(replace(result, fit=replace(fit, reached=each)))) for each in (True, False)]
     assert "stopped short of its minimum" not in said[0]
     assert "stopped short of its minimum" in said[1]
+    assert "Do not use" not in said[0]
+    assert "Do not use" in " ".join(calibration_lines(replace(result, contradictory=True)))
 
 
 def explained(known: KnownChain, std: NDArray[np.float64]) -> Any:

@@ -76,7 +76,7 @@ def test_a_full_disk_at_the_start_is_said_and_one_at_the_end_needs_nothing(
 
     recorder = Recorder(tmp_path / "fine.npy", 1, 10)
     monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(RunFolderError, match="cannot be written: No space left"):
+    with pytest.raises(RunFolderError, match=r"cannot be written: No space left on device\. Free some space"):
         Recorder(tmp_path / "samples.npy", 1, 10)
     monkeypatch.setattr(np, "save", full)
     recorder.close()
