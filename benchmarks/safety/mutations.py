@@ -50,7 +50,8 @@ TESTS = {
     "hil/experiment/checks/work.py": [f"{_EXPERIMENT}/checks/test_work.py", f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/checks/following.py": [f"{_EXPERIMENT}/checks/test_following.py"],
     "hil/experiment/checks/consistency.py": [
-        *(f"{_EXPERIMENT}/checks/test_jumps_and_noise.py", f"{_EXPERIMENT}/checks/test_consistency.py"),
+        *(f"{_EXPERIMENT}/checks/test_disagreement.py", f"{_EXPERIMENT}/checks/test_jumps_and_noise.py"),
+        f"{_EXPERIMENT}/checks/test_consistency.py",
     ],
     "hil/experiment/status_check.py": [f"{_EXPERIMENT}/test_status_check.py"],
     "hil/experiment/repetition.py": [f"{_EXPERIMENT}/test_repetition.py"],
