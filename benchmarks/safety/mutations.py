@@ -102,6 +102,12 @@ EQUIVALENT = {
         "0  ->  1",
     ): "joint_checks: compiled by a call for none of the joints",
     ("_look(joints, self._sample, 0, 0, 0.0, 0.0,", "0.0  ->  1.0"): "joint_checks: as above",
+    (
+        "* copysign(1.0, lacking)",
+        "self._constants[index] * (goal - carried) * copysign(1.0, lacking)  ->  "
+        "self._constants[index] * (goal - carried) / copysign(1.0, lacking)",
+    ): "joint_faults: 1 or -1",
+    ("abs(currents[0]) > least", "0  ->  1"): "joint_faults: all of them are the same",
     ("return -1.0", "1.0  ->  2.0"): "work, following: any negative number",
     ("_OF_OTHERS * others else -1.0", "1.0  ->  2.0"): "work: any negative number",
     ("count & (count - 1) == 0", "1  ->  2"): "current_noise: the same for every count from 2 on",

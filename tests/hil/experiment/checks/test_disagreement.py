@@ -20,7 +20,8 @@ def motion_with_rests(count: int, seed: int) -> list[tuple[float, float, float, 
 
     At rest, the position first drifts slowly and then jumps by less than a servo would be stopped for.
     """
-    random, samples, now, angle = Random(seed), [], 0.0, 0.0
+    samples: list[tuple[float, float, float, float]] = []
+    random, now, angle = Random(seed), 0.0, 0.0
     for index in range(count):
         seconds = random.choice((0.002, 0.0025, 0.004)) if index else 0.0
         now += seconds
