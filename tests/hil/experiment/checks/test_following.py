@@ -319,3 +319,32 @@ def test_after_a_missed_reply_the_readings_begin_anew() -> None:
         goal = 0.5 * planned * index / 100
         found = is_frozen(goals[0], goal, 0.1, 0.01, index % 20 > 0)
         assert not found
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("rate", [*RATES, 512])
+def test_frozen_readings_are_those_that_no_goals_of_30_ms_before_each_could_all_explain(rate: int, sign: float) -> None:
+    """Compared with lists of all goals in the present 10 ms and in the three times 10 ms before, at random goals."""
+    config, planned = joints("xm430_two_link")[0]
+    goals, random = np.zeros(1, GOALS), Random(rate)
+    begin(np.zeros(1, MEMORY)[0], goals[0], config, planned, 0.3, 0.05)
+    most = float(goals["most"][0])
+    blocks, age, former, lowest, highest, same_for = [[0.0]] * 4, 0.0, 0.0, 0.0, 0.0, 0.0
+    goal, slope, found = 0.0, 0.0, []
+    for index in range(3 * rate):
+        if random.random() < 20.0 / rate:
+            slope = random.choice((0.0, random.uniform(-5.0, 20.0))) * most
+        goal += sign * slope / rate + 0.02 * most * random.gauss(0.0, 1.0)
+        stands, carried = random.random() > 1.0 / rate, 0.1 if random.random() > 1.0 / rate else 0.2
+        age += 1 / rate
+        blocks = [[goal], *blocks[:3]] if age >= 0.0099 else [[*blocks[0], goal], *blocks[1:]]
+        age = 0.0 if age >= 0.0099 else age
+        low, high = min(map(min, blocks)), max(map(max, blocks))
+        if not stands or carried != former:
+            former, lowest, highest, same_for = carried, high, low, 0.0
+        else:
+            lowest, highest, same_for = min(lowest, high), max(highest, low), same_for + 1 / rate
+        found.append(bool(is_frozen(goals[0], goal, carried, 1 / rate, stands)))
+        assert found[-1] == (highest - lowest > most), index
+        assert goals["same_for"][0] == pytest.approx(same_for)
+    assert 0.01 < sum(found) / len(found) < 0.99
