@@ -102,6 +102,15 @@ def test_after_lost_replies_nothing_is_remembered_of_the_motion() -> None:
     assert memory["same"]["count"] == memory["same"]["moved"] == 0.0
 
 
+def test_an_interval_longer_than_the_slow_memory_leaves_nothing_of_what_was_before() -> None:
+    look = Consistency()
+    look.look(0.0, 0.2, 0.0)
+    look.memory["heading"], look.memory["roughness"], look.memory["slow"]["apart"] = -9.0, 9.0, 0.01
+    look.look(6.0, 0.2, 30.0)
+    assert (look.memory["heading"], look.memory["roughness"]) == (30.0, pytest.approx(0.0, abs=1e-9))
+    assert look.memory["slow"]["apart"] == pytest.approx(0.0, abs=1e-9)
+
+
 def told(part: str, **fields: float) -> Consistency:
     """A joint at 1 rad/s whose memory `part` holds these; lag and scale error are 0.01 s and 0.05 at most."""
     look = Consistency()
@@ -250,15 +259,18 @@ def test_no_lag_is_estimated_from_a_state_whose_time_is_unknown(unsure: float, c
 
 
 def looks_until_frozen(
-    rate: int, first: float, velocity: float = 1.0, unsure: float = 0.0, scale: float = 0.06
+    rate: int, first: float, velocity: float = 1.0, unsure: float = 0.0, scale: float = 0.06, skipped: int = 0
 ) -> int | None:
-    """Number of intervals until a velocity counts as frozen: in the first 10 ms, the joint moves by `first` [rad]."""
+    """Number of intervals until a velocity counts as frozen: in the first 10 ms, the joint moves by `first` [rad].
+
+    skipped: intervals before, in which it moves at its velocity.
+    """
     look = Consistency()
     look.look(0.0, velocity, 0.0, unsure)
     look.memory["scale"] = scale
     at_first, position = max(1, rate // 100), 0.0
     for number in range(1, 8 * at_first):
-        position += first / at_first if number <= at_first else velocity / rate
+        position += first / at_first if skipped < number <= skipped + at_first else velocity / rate
         for part in ("short", "long", "slow"):
             look.memory[part]["unknown"] = 9.0  # these accept anything
         if look.look(position, velocity, 1 / rate, unsure):
@@ -274,6 +286,13 @@ def test_a_velocity_that_stays_the_same_was_that_of_the_joint_30_ms_ago(rate: in
     most = (0.02 + 0.025 * seconds + seconds) / 0.94
     assert looks_until_frozen(rate, sign * NEARLY * most, sign) is None
     assert looks_until_frozen(rate, sign * BEYOND * most, sign) == number
+
+
+@pytest.mark.parametrize(("rate", "skipped", "number"), [(400, 4, 20), (100, 1, 5), (50, 1, 4), (20, 1, 3)])
+def test_what_a_joint_did_less_than_30_ms_ago_may_not_show_in_its_velocity_yet(
+    rate: int, skipped: int, number: int
+) -> None:
+    assert looks_until_frozen(rate, 0.15, skipped=skipped) == number
 
 
 @pytest.mark.parametrize(
