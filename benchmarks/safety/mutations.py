@@ -109,6 +109,7 @@ EQUIVALENT = {
     ): "joint_faults: 1 or -1",
     ("abs(currents[0]) > least", "0  ->  1"): "joint_faults: all of them are the same",
     ("_add(slow, SLOW_S, moved, memory.seen", "0.0  ->  1.0"): "consistency: the next line replaces what it adds up",
+    ("notes = np.ceil(LAG_S / same.since", "0.05  ->  0.1"): "consistency: at a few rates, 27 ms then count as 30 ms",
     ("return -1.0", "1.0  ->  2.0"): "work, following: any negative number",
     ("_OF_OTHERS * others else -1.0", "1.0  ->  2.0"): "work: any negative number",
     ("count & (count - 1) == 0", "1  ->  2"): "current_noise: the same for every count from 2 on",
