@@ -5,7 +5,8 @@
 Each mutation changes one operator, comparison, number or boolean of a module (except in strings, annotations and zip's
 `strict`); the module's tests then run in a child process. Mutations that no test detects survive. A mutation that makes
 a test hang counts as detected after `PATIENCE_S`. With NUMBA_DISABLE_JIT=1, compiled modules are tested as plain
-Python; compiling every mutation would be the slowest step.
+Python, because compiling every mutation would be the slowest step; modules whose records are read by field name
+(`checks`, `repetition`) need the compiler.
 """
 
 import argparse
