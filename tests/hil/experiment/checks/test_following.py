@@ -265,6 +265,14 @@ def test_a_reply_may_be_measured_before_or_after_the_motor_has_the_goal() -> Non
         assert follow.look(0.5 if number % 2 else -0.5, 0.4 if number % 4 < 2 else -0.4, STEP) is None
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_no_current_is_compared_with_the_lower_of_two_goals(sign: float) -> None:
+    """Of 0.11 A, a sensor may show a fifth less: 0.088^2 200 = 1.55 from every reply but the first, 49.6 of which."""
+    follow = Following(joints("xm430_two_link")[0][0], 1.0, 1.0, 1.0)
+    found = [follow.look(sign * (0.5 if number % 2 else 0.11), 0.0, STEP) for number in range(51)]
+    assert found == [None] * 50 + [50 * STEP]
+
+
 @pytest.mark.parametrize("name", REAL)
 @pytest.mark.parametrize("rate", RATES)
 @pytest.mark.parametrize("turns", [False, True])
