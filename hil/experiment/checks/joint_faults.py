@@ -197,7 +197,7 @@ class JointFaults:
                 f"Its goal register reads {held:.3f} {unit}, which matches the measured value: another program is "
                 "commanding it, or goals are being altered or lost in transit."
             )
-        along = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
+        along = carried if commanded >= 0.0 else -carried
         allowed = self._records[index]["following"]["allowed"]
         readings, least = self._recent.currents(index), self._records[index]["goals"]["most"]
         if _is_stuck(readings, least):

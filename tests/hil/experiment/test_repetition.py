@@ -137,6 +137,30 @@ def test_a_disturbance_that_begins_before_the_end_of_a_period_is_not_accepted_in
     assert unlike_at(periods) == (3, 2, 0)
 
 
+@pytest.mark.parametrize(("size", "found"), [(0.199, None), (0.201, (3, 2, 0))])
+def test_what_happened_before_the_last_fifth_of_a_second_is_accepted_in_the_next_period(
+    size: float, found: tuple[int, int, int] | None
+) -> None:
+    """The 80 samples before it differed by 30 mrad in a quarter of them, 15 mrad RMS."""
+    periods = np.zeros((4, 1, 200))
+    periods[2, 0, 160:180] = 0.03
+    periods[3, 0, :100] = size
+    assert unlike_at(periods) == found
+
+
+@pytest.mark.parametrize(("size", "found"), [(0.149, None), (0.151, (1, 152, 0))])
+@pytest.mark.parametrize("known", [100, 1])
+def test_the_tolerance_in_the_second_period_is_that_of_all_known_samples_in_its_first_half(
+    known: int, size: float, found: tuple[int, int, int] | None
+) -> None:
+    """10 mrad RMS, of however few replies."""
+    periods = np.zeros((2, 1, 200))
+    periods[1, 0, :100] = math.nan
+    periods[1, 0, 100 - known : 100] = 0.01
+    periods[1, 0, 150:] = size
+    assert unlike_at(periods) == found
+
+
 def test_other_torques_may_give_another_motion() -> None:
     """A held-out segment follows the one that is fitted."""
     first, second = drifting(4, 1e-3), drifting(5, 1e-3) * 0.3 + 0.5

@@ -10,7 +10,7 @@ from hil.drivers.errors import PortLost
 from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import Cause, ExperimentError, NotSettled, SafetyStop, StopRequested
-from hil.plan.brake import Brake, braking_gains, may_brake
+from hil.plan.brake import NOTICED_AFTER, Brake, braking_gains, may_brake
 from tests.support.motion import brake_of, seen_moving
 
 Arm = Callable[..., Config]
@@ -100,6 +100,25 @@ def test_a_joint_that_is_still_faster_after_a_while_ends_it(arm: Arm, more: floa
     faster = MOVING._replace(velocity=(0.0, -4.0 - more))
     goals = [brake.goals(each) for each in (MOVING, *8 * [faster])]
     assert None not in goals[:8] and (goals[8] is not None) is goes_on
+
+
+@pytest.mark.parametrize(("interval", "samples"), [(0.0025, 8), (0.01, 2), (0.002, 10)])
+def test_a_while_is_the_same_time_however_long_an_exchange_takes(arm: Arm, interval: float, samples: int) -> None:
+    brake = Brake(arm(), interval, seen_moving(arm(), MOVING, interval))
+    faster = MOVING._replace(velocity=(0.0, -4.0 - 1.3))
+    goals = [brake.goals(each) for each in (MOVING, *samples * [faster])]
+    assert None not in goals[:samples] and goals[samples] is None
+
+
+def test_a_brake_that_drives_acts_as_long_as_the_dry_run_assumes(arm: Arm) -> None:
+    """What one state calls for is sent in the next exchange, whose own state shows none of its effect yet."""
+    brake, velocity, acted = brake_of(arm(), MOVING), -4.0, 0
+    goals = brake.goals(MOVING)
+    while goals is not None:
+        acted += 1  # from this exchange until the next one
+        goals = brake.goals(MOVING._replace(velocity=(0.0, velocity)))
+        velocity -= 4.1  # more than a fifth of the limit
+    assert acted == NOTICED_AFTER
 
 
 @pytest.mark.parametrize("interval", [0.0025, 0.01])

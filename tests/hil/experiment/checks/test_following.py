@@ -265,6 +265,14 @@ def test_a_reply_may_be_measured_before_or_after_the_motor_has_the_goal() -> Non
         assert follow.look(0.5 if number % 2 else -0.5, 0.4 if number % 4 < 2 else -0.4, STEP) is None
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_no_current_is_compared_with_the_lower_of_two_goals(sign: float) -> None:
+    """Of 0.11 A, a sensor may show a fifth less: 0.088^2 200 = 1.55 from every reply but the first, 49.6 of which."""
+    follow = Following(joints("xm430_two_link")[0][0], 1.0, 1.0, 1.0)
+    found = [follow.look(sign * (0.5 if number % 2 else 0.11), 0.0, STEP) for number in range(51)]
+    assert found == [None] * 50 + [50 * STEP]
+
+
 @pytest.mark.parametrize("name", REAL)
 @pytest.mark.parametrize("rate", RATES)
 @pytest.mark.parametrize("turns", [False, True])
@@ -319,3 +327,85 @@ def test_after_a_missed_reply_the_readings_begin_anew() -> None:
         goal = 0.5 * planned * index / 100
         found = is_frozen(goals[0], goal, 0.1, 0.01, index % 20 > 0)
         assert not found
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("rate", [*RATES, 512])
+def test_frozen_readings_are_those_that_no_goals_of_30_ms_before_each_could_all_explain(rate: int, sign: float) -> None:
+    """Compared with lists of all goals in the present 10 ms and in the three times 10 ms before, at random goals."""
+    config, planned = joints("xm430_two_link")[0]
+    goals, random = np.zeros(1, GOALS), Random(rate)
+    begin(np.zeros(1, MEMORY)[0], goals[0], config, planned, 0.3, 0.05)
+    most = float(goals["most"][0])
+    blocks, age, former, lowest, highest, same_for = [[0.0]] * 4, 0.0, 0.0, 0.0, 0.0, 0.0
+    goal, slope, found = 0.0, 0.0, []
+    for index in range(3 * rate):
+        if random.random() < 20.0 / rate:
+            slope = random.choice((0.0, random.uniform(-5.0, 20.0))) * most
+        goal += sign * slope / rate + 0.02 * most * random.gauss(0.0, 1.0)
+        stands, carried = random.random() > 1.0 / rate, 0.1 if random.random() > 1.0 / rate else 0.2
+        age += 1 / rate
+        blocks = [[goal], *blocks[:3]] if age >= 0.0099 else [[*blocks[0], goal], *blocks[1:]]
+        age = 0.0 if age >= 0.0099 else age
+        low, high = min(map(min, blocks)), max(map(max, blocks))
+        if not stands or carried != former:
+            former, lowest, highest, same_for = carried, high, low, 0.0
+        else:
+            lowest, highest, same_for = min(lowest, high), max(highest, low), same_for + 1 / rate
+        found.append(bool(is_frozen(goals[0], goal, carried, 1 / rate, stands)))
+        assert found[-1] == (highest - lowest > most), index
+        assert goals["same_for"][0] == pytest.approx(same_for)
+    assert 0.01 < sum(found) / len(found) < 0.99
+
+
+def rested(noise: float, planned: float, share: float = 1.0, name: str = "xm430_two_link") -> tuple[Following, float]:
+    """A joint whose current was off by `noise` at rest, back and forth, and the largest sigma that this may mean [A].
+
+    With a share of 1, only what looks like no current is found.
+    """
+    config = joints(name)[0][0]
+    follow = Following(config, planned, share, LASTING if share < 1.0 else 1.0)
+    assert follow.rest(config, [noise, *[-noise, noise] * 50], STEP, planned)
+    tick = abs(config.joint.drive_unit(12.0))
+    return follow, 1.4826 * (noise + 0.5 * tick) / (1.0 - 0.19)
+
+
+@pytest.mark.parametrize(("noise", "replies"), [(0.001, 2), (0.1, 4)])
+def test_a_noisy_sensor_must_agree_more_often_however_slow_the_rate(noise: float, replies: int) -> None:
+    """Each reply counts 5 at most; 10 are needed, and 16 of a sensor that is noisier than usual."""
+    follow, _ = rested(noise, 1.0)
+    assert replies_until_seen(follow, 5.0, 0.0, 0.0625) == (replies, replies * 0.0625)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.1])
+def test_a_noisy_current_may_be_four_sigma_away_besides_a_scale_error(share: float) -> None:
+    """The scale error is a fifth of the plan, or less if less may be missing."""
+    for nearly, is_found in ((0.98, False), (1.02, True)):
+        follow, sigma = rested(0.1, 1.0, share)
+        most = min(share, 0.2) + 4.0 * sigma
+        assert (replies_until_seen(follow, 0.5, 0.5 + nearly * most)[0] > 0) is is_found
+
+
+@pytest.mark.parametrize(("name", "tick"), [("xm430_two_link", 2.69e-3), ("xl430_two_link", 12.0 / 885)])
+@pytest.mark.parametrize(("noise", "planned"), [(0.0, 0.01), (0.0, 2.0), (0.1, 0.01)])
+def test_how_far_a_goal_may_go_before_readings_that_stay_the_same_are_frozen(
+    name: str, tick: float, noise: float, planned: float
+) -> None:
+    """Noise, ticks or a share of the plan, whichever is most, and a tick, of a sensor that shows a fifth less."""
+    follow, sigma = rested(noise, planned, name=name)
+    known = max(0.05 * planned, 4.0 * tick, 4.0 * sigma if noise else 0.0)
+    assert follow.most_under_same == pytest.approx((known + tick) / 0.8, rel=0.01)
+
+
+@pytest.mark.parametrize(("interval", "needed"), [(0.0025, 1.5), (0.05, 5.0)])
+def test_from_which_goal_on_lost_torque_is_found_in_a_tenth_of_a_second(interval: float, needed: float) -> None:
+    """A log likelihood ratio of 50 per second, or of 10 in two replies at 20 Hz; 0.8 of the goal counts."""
+    follow = following()
+    assert follow.seen_above(interval) == pytest.approx(math.sqrt(2.0 * needed) * 0.05 / 0.8)
+    assert seen_after(follow, round(1 / interval), lambda _: 1.3 * follow.seen_above(interval), lambda *_: 0.0) <= 0.1
+
+
+def test_a_small_plan_in_volts_allows_four_ticks() -> None:
+    for ticks, is_found in ((3.9, False), (4.1, True)):
+        follow = following(0.01, "xl430_two_link")
+        assert (replies_until_seen(follow, 0.0, ticks * 12.0 / 885)[0] > 0) is is_found
