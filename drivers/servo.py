@@ -85,8 +85,8 @@ class Servo:
             if is_its_own and self.read_despite_error(register) == first:
                 return first
         raise InconsistentReplies(
-            f"{self.title}: {register} reads differently each time: its replies are late and belong to earlier "
-            "requests. Check the adapter."
+            f"{self.title}: {register} reads differently each time: its replies are late or repeated and belong to "
+            "earlier requests. Check the adapter."
         )
 
     def read_entry(self, entry: Register, attempts: int = _ATTEMPTS, *, despite_error: bool = False) -> int:

@@ -91,9 +91,9 @@ def read_settings(servo: Servo) -> dict[str, int]:
     for name in reversed(names):
         if (again := servo.read(name)) != settings[name]:
             raise WrongReply(
-                f"{servo.title}: {name} reads {settings[name]}, then {again}: its replies are late and belong to "
-                "earlier requests, or another program is changing its settings. Check the adapter, and close other "
-                "programs that use this port."
+                f"{servo.title}: {name} reads {settings[name]}, then {again}: its replies are late or repeated and "
+                "belong to earlier requests, or another program is changing its settings. Check the adapter, and close "
+                "other programs that use this port."
             )
     watchdog = servo.read("Bus Watchdog")
     # A tripped watchdog can only be cleared, which switches it off.

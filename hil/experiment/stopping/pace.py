@@ -46,7 +46,7 @@ class Pace:
         """
         if not are_late and not self._was_late:
             # Lost replies are asked for again soon; the last exchange before the limit waits for late ones.
-            is_last = not are_damaged and unheard + self._least + max(self._least, self._interval) > BRIDGED_ALONE_S
+            is_last = not are_damaged and unheard + self._least > BRIDGED_ALONE_S
             return self._usual if is_last else min(max(self._least, self._longest + MARGIN_S), self._usual)
         return max(min(max(self._least, LONGEST_S), LAST_S - unheard), LONGER_S)
 
