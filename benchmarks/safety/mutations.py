@@ -33,7 +33,11 @@ PATIENCE_S = 300
 _EXPERIMENT = "tests/hil/experiment"
 TESTS = {
     "hil/experiment/guard.py": [
-        *(f"{_EXPERIMENT}/{name}" for name in ("test_guard.py", "test_held_at_rest.py", "test_status_check.py")),
+        *(
+            f"{_EXPERIMENT}/{name}"
+            for name in ("test_guard.py", "test_guard_silence.py", "checks/test_joint_faults.py")
+        ),
+        *(f"{_EXPERIMENT}/{name}" for name in ("test_held_at_rest.py", "test_status_check.py", "checks/test_apart.py")),
         f"{_EXPERIMENT}/stops",
     ],
     "hil/experiment/command_limits.py": [f"{_EXPERIMENT}/test_command_limits.py", f"{_EXPERIMENT}/test_guard.py"],
@@ -53,6 +57,9 @@ TESTS = {
     "hil/experiment/status_check.py": [f"{_EXPERIMENT}/test_status_check.py"],
     "hil/experiment/repetition.py": [f"{_EXPERIMENT}/test_repetition.py"],
     "hil/experiment/deadlines.py": [f"{_EXPERIMENT}/test_deadlines.py"],
+    "hil/experiment/silence.py": [
+        *(f"{_EXPERIMENT}/{name}" for name in ("test_deadlines.py", "test_guard_silence.py", "test_guard.py"))
+    ],
     "hil/experiment/stop_request.py": [f"{_EXPERIMENT}/test_stop_request.py"],
     "hil/plan/silence.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/plan/brake.py": ["tests/hil/plan/test_brake.py"],

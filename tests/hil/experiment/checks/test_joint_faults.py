@@ -1,14 +1,16 @@
 """How a joint's fault is explained: the supply, altered goals, or torque that is off."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
-from hil.config.schema import Config
+from hil.config.schema import Config, load_config
 from hil.drivers.state import State, Status
 from hil.errors import Cause, SafetyStop
 from hil.experiment.guard import Guard
 from tests.support.motion import STILL, at
+from tests.support.paths import CONFIGS
 
 Arm = Callable[..., Config]
 LACKING = STILL._replace(goal_current=(0.0, 0.3), current=(0.0, 0.1), velocity=(0.0, 4.6))
@@ -70,3 +72,33 @@ def test_what_a_current_that_does_not_follow_suggests(arm: Arm, goal: float, car
         for number in range(60):
             guard.look(at(number, wrong))
     assert stop.value.cause in (Cause.NOT_FOLLOWING, Cause.GOALS_CHANGED)
+
+
+@pytest.mark.parametrize(("driven_by", "stops"), [("voltage", True), ("current", False)])
+def test_a_servo_that_senses_its_supply_current_is_compared_with_its_goal_only_in_volts(
+    tmp_path: Path, driven_by: str, stops: bool
+) -> None:
+    text = (CONFIGS / "xl330_two_link.toml").read_text(encoding="utf-8")
+    if driven_by == "voltage":
+        for old, new in (
+            ("torque_constant = 0.354 ", 'mode = "pwm"\ntorque_per_volt = 0.1 '),
+            ("torque_constant_std = 0.035 ", "torque_per_volt_std = 0.01 "),
+            ("current_limit = 0.44 ", "voltage_limit = 3.0 "),
+        ):
+            assert text.count(old) == 2
+            text = text.replace(old, new)
+    path = tmp_path / "arm.toml"
+    path.write_text(text, encoding="utf-8")
+    config = load_config(path)
+    guard, goal = Guard(config), 0.9 * config.joints[1].goal_limit
+    without = STILL._replace(goal_current=(0.0, goal))
+
+    def look() -> None:
+        for number in range(60):
+            guard.look(at(number, without))
+
+    if not stops:
+        return look()
+    with pytest.raises(SafetyStop) as stop:
+        look()
+    assert stop.value.cause is Cause.NOT_FOLLOWING
