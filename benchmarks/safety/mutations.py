@@ -66,7 +66,7 @@ TESTS = {
     "hil/plan/recent_motion.py": ["tests/hil/plan/test_recent_motion.py", "tests/hil/plan/test_brake.py"],
     "hil/experiment/pace.py": [f"{_EXPERIMENT}/stream/test_stream_schedule.py"],
     "hil/experiment/stream.py": [
-        f"{_EXPERIMENT}/stream/test_stream_schedule.py",
+        *(f"{_EXPERIMENT}/stream/test_stream_{name}.py" for name in ("schedule", "findings")),
         *(f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/stops"),
     ],
     "hil/drivers/exchange.py": [
