@@ -152,7 +152,7 @@ class ReadBackExchange(Exchange):
                 back.kind = GOALS  # they take less time to read; the other registers remain due
                 return self._held(back, due)
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
-            left_less_time = self._latest_plan is not self._usual
+            left_less_time = self._latest_plan.read is not self._usual.read
             self.read_back_at = now if self._late_possible or left_less_time else now + TRY_AGAIN_S
             return None
         port.clock.wait_until(due - takes - HOST_S)

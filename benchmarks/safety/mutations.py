@@ -119,6 +119,7 @@ EQUIVALENT = {
     ("self._states: deque[State]", "3  ->  6"): "recent_motion: more exchanges are kept than are used",
     ("low = max((each.low", "0.0  ->  1.0"): "recent_motion: without any travel, the upper end is 0 as well",
     ("_NEVER = ", "62  ->  124"): "exchange: more cycles than any run has",
+    ("AFTER_LOSS = 5", "5  ->  10"): "exchange: replies that are late by more cycles are recognised as well",
     ("self._modes_due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: the first comparison sets it",
     (
         "self._clock = [",

@@ -322,9 +322,6 @@ class Guard:
         )
 
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
-        joint = self._joints[index]
-        if self._missing[index] == 0 and isnan(joint["position"]):
-            joint["seen_at"] = now
         # An error with a valid checksum is an answer, not a lost packet: one is enough, unless it reports that the
         # request was damaged.
         refused = bool(error) and error != StatusError.CRC
