@@ -83,7 +83,7 @@ TESTS = {
     ],
     "hil/drivers/others/read_back.py": ["tests/drivers/test_sightings.py", "tests/drivers/test_read_back.py"],
     "hil/drivers/torque/switch.py": [
-        *("tests/drivers/torque/test_switch.py", "tests/drivers/torque/test_reports.py"),
+        *(f"tests/drivers/torque/test_{name}.py" for name in ("switch", "switch_times", "reports")),
         "tests/drivers/test_bus.py",
     ],
     "hil/drivers/torque/off.py": [
@@ -113,6 +113,7 @@ EQUIVALENT = {
         "self._was_irregular = False",
         "False  ->  True",
     ): "guard: after a regular exchange, one more is processed like an irregular one",
+    ("if volt > 0.0 and", "0.0  ->  1.0"): "guard: no servo runs on 1 V",
     ("for _ in range(0, self._plan.end_samples", "0  ->  1"): "stream: a multiple of the window has as many steps",
     ("ticks.wait() if number else", "0.0  ->  1.0"): "stream: a value that is not used",
     ("abs(travels[-1].moved)", "-1  ->  +1"): "recent_motion: the last of two",
