@@ -123,6 +123,12 @@ EQUIVALENT = {
     ("AFTER_LOSS = 5", "5  ->  10"): "exchange: replies that are late by more cycles are recognised as well",
     ("self._modes_due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: the first comparison sets it",
     (
+        "self._goals_since = 0",
+        "0  ->  1",
+    ): "read_back: the first read-back, which is of modes, sets it",
+    ("self._cycles = 0", "0  ->  1"): "status_check: of the goals sent before the first agreement, one more is known",
+    ("self._agreed_at = [0]", "0  ->  1"): "status_check: of the goals sent before the first agreement, all are known",
+    (
         "self._clock = [",
         "0.0  ->  1.0",
     ): "status_check: a clock's offset and its time, not used before the first reading",

@@ -155,7 +155,7 @@ def _packets_within(received: bytes) -> list[Packet]:
         end = at + _BEFORE_LENGTH + int.from_bytes(received[at + 5 : at + 7], "little")
         packets = list(Framer().feed(received[at:end])) if end <= len(received) else []
         found += packets
-        at = received.find(HEADER, end if packets else at + 1)
+        at = received.find(HEADER, end if packets else at + len(HEADER))
     return found
 
 
@@ -168,7 +168,7 @@ def _fronts_of_replies(received: bytes) -> Iterator[tuple[int, int]]:
             length = int.from_bytes(front[5:7], "little")
             stuffed = received.count(b"\xff\xff\xfd\xfd", at, at + _BEFORE_LENGTH + length)
             yield front[4], length - stuffed - _BESIDE_DATA
-        at = received.find(HEADER, at + 1)
+        at = received.find(HEADER, at + len(HEADER))
 
 
 def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:

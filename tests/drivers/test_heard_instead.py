@@ -1,12 +1,14 @@
 """What is said of bytes that arrived instead of complete replies: damaged, late, or intact under another ID."""
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from hil.drivers.bus import ServoBus
-from hil.drivers.packet import encode_status
+from hil.drivers.bus import BusConfig, ServoBus
+from hil.drivers.errors import DriverError
+from hil.drivers.packet import Instruction, encode, encode_status
 from tests.drivers.test_exchange import Wire, answer, exchange, fast_answer, state
 
 FINE = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
@@ -40,6 +42,37 @@ def test_intact_replies_with_an_id_that_was_not_asked_are_not_called_damaged(fas
 @pytest.mark.parametrize("fast", [False, True])
 def test_nor_are_two_replies_with_the_same_id(fast: bool) -> None:
     assert said(both(2, 2, fast=fast), fast=fast).startswith("Intact replies came from IDs 2, 2, although")
+
+
+def test_or_the_same_servos_in_another_order() -> None:
+    assert said(both(2, 1, fast=False)).startswith("Intact replies came from IDs 2, 1, although each servo was asked")
+    twice = answer(1, 1, 2, 3) + answer(1, 1, 2, 3) + b"noise"
+    assert said(twice).startswith("Intact replies came from IDs 1, 1, although each servo was asked once")
+
+
+@pytest.mark.parametrize(("count", "stops"), [(2, False), (3, True)])
+@pytest.mark.parametrize(
+    ("kind", "message"), [("strangers", "has sent or requested 3 packets"), ("mixed_up", "Intact")]
+)
+def test_two_foreign_packets_or_replies_under_other_ids_are_borne_and_three_are_not(
+    fake_config: Callable[..., BusConfig], kind: str, message: str, count: int, stops: bool
+) -> None:
+    """A late reply can look like one."""
+    with ServoBus.open(fake_config()) as bus:
+        setattr(bus.prepared.heard, kind, count)
+        if not stops:
+            bus.exchange([0.0, 0.0])
+            return
+        with pytest.raises(DriverError, match=message):
+            bus.exchange([0.0, 0.0])
+
+
+@pytest.mark.parametrize("data_bytes", [16, 21])
+def test_another_masters_instruction_as_long_as_a_reply_is_no_late_reply(data_bytes: int) -> None:
+    """The slow registers, which are read now and then, have 16 and 21 bytes."""
+    written = encode(1, Instruction.WRITE, bytes(data_bytes + 1))
+    assert not said(written).startswith("Replies did arrive, but too late")
+    assert said(encode_status(1, 0, bytes(data_bytes))[:-1]).startswith("Replies did arrive, but too late")
 
 
 @pytest.mark.parametrize(("ids", "fast"), [((2, 2), False), ((1, 1), False), ((2, 1), False), ((2, 2), True)])

@@ -225,6 +225,18 @@ def test_a_read_back_delays_the_next_cycle_only_if_overdue_and_without_time_befo
     assert wire.now() - began <= waited_s + 0.2 * 0.0025 + 1e-9
 
 
+def test_an_overdue_read_back_may_take_up_most_of_the_next_cycle() -> None:
+    """Eight tenths of it, if its reply is lost."""
+    wire = Wire()
+    cycles = ready(wire, 0.0025)
+    back = cycles._read_back
+    assert back is not None
+    due = wire.now() + 0.0002
+    back.overdue_at = wire.now()
+    cycles.overruled(due)
+    assert wire.written and wire.now() == pytest.approx(due + 0.8 * 0.0025)
+
+
 def test_a_stall_during_a_read_back_does_not_prevent_the_next_one() -> None:
     wire = Wire()
     cycles = ready(wire)

@@ -168,7 +168,8 @@ def test_goals_that_a_late_reply_may_have_destroyed_are_not_counted_as_missed(co
         now += 0.01
         goals: list[Answer] = [(0, WATCHDOG, LIMIT, goal) for goal in (SENT[-1][0], SENT[-2][1])]
         servos: list[Answer] = [(0, MODE)] * 2 if reads_modes(back) else goals
-        assert back.look(servos, SENT, now, collided=collided) is None
+        said = {"collided": True} if collided else {}
+        assert back.look(servos, SENT, now, **said) is None
     assert (back.lost is None) is collided and back.is_unexpected
 
 
@@ -215,3 +216,22 @@ def test_at_least_one_read_back_of_goals_follows_each_of_modes_and_four_in_doubt
                 goals += 1
             look(back, now)
         assert counts == {least, 99}
+
+
+@pytest.mark.parametrize(("delay", "least", "most"), [(0.0005, 0.025, 0.05), (0.002, 0.0375, 0.075)])
+def test_the_next_overdue_read_back_follows_the_sooner_the_shorter_the_delay(
+    delay: float, least: float, most: float
+) -> None:
+    """After up to 100 times the delay, and at most 75 ms: at random, so that no other program escapes by its rhythm."""
+    back, pauses = read_back(), []
+    for now in range(100):
+        back.delayed(float(now), delay, alone=False)
+        pauses.append(back.overdue_at - now)
+    assert least <= min(pauses) < 1.1 * least and 0.95 * most < max(pauses) <= most
+    back.delayed(100.0, 0.0, alone=False)
+    assert back.overdue_at == pytest.approx(100.075), "without a delay it is not random"
+
+
+def test_the_shortest_read_is_that_of_one_goal_also_of_an_arm_with_one_servo() -> None:
+    one = ReadBack((1,), GOALS, MODES, [(MODE,)], TORQUE, [(LIMIT,)], fast=False)
+    assert one.shortest.reply_size == one.reads[0].reply_size
