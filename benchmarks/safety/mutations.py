@@ -121,7 +121,6 @@ EQUIVALENT = {
     ("low = max((each.low", "0.0  ->  1.0"): "recent_motion: without any travel, the upper end is 0 as well",
     ("_NEVER = ", "62  ->  124"): "exchange: more cycles than any run has",
     ("AFTER_LOSS = 5", "5  ->  10"): "exchange: replies that are late by more cycles are recognised as well",
-    ("self._modes_due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: the first comparison sets it",
     (
         "self._goals_since = 0",
         "0  ->  1",

@@ -139,7 +139,7 @@ class ReadBack:
         """Index of the servo to read if there is only time for one."""
         self.modes_seen_at = -math.inf
         """Time of the latest read-back that found the expected settings in every servo [s]."""
-        self._due = {MODES: -math.inf} | ({TORQUE: -math.inf} if watches_torque else {})
+        self._due = dict.fromkeys((MODES, TORQUE) if watches_torque else (MODES,), -math.inf)
         """Times at which the registers other than goals are due [s]."""
         self._goals_since = 0
         self._was_of_goals = False

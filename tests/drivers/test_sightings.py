@@ -1,6 +1,7 @@
 """How many foreign values, in which time, prove that another program writes to a servo."""
 
 import itertools
+import math
 
 import pytest
 
@@ -235,3 +236,50 @@ def test_the_next_overdue_read_back_follows_the_sooner_the_shorter_the_delay(
 def test_the_shortest_read_is_that_of_one_goal_also_of_an_arm_with_one_servo() -> None:
     one = ReadBack((1,), GOALS, MODES, [(MODE,)], TORQUE, [(LIMIT,)], fast=False)
     assert one.shortest.reply_size == one.reads[0].reply_size
+
+
+@pytest.mark.parametrize("is_silent", [False, True])
+def test_modes_are_confirmed_by_the_answers_of_all_servos(is_silent: bool) -> None:
+    back = read_back()
+    assert back.modes_seen_at == -math.inf and reads_modes(back)
+    back.look([(0, MODE), None if is_silent else (0, MODE)], SENT, 1.0)
+    assert back.modes_seen_at == (-math.inf if is_silent else 1.0)
+    while not reads_modes(back):
+        look(back, 2.0)
+    back.look([(0, MODE), (0, OTHER_MODE)], SENT, 3.0)
+    assert back.modes_seen_at == (-math.inf if is_silent else 1.0)
+
+
+@pytest.mark.parametrize("watches_torque", [False, True])
+def test_torque_is_read_back_ten_times_a_second_if_no_status_shows_it(watches_torque: bool) -> None:
+    back = ReadBack(
+        *((1, 2), GOALS, MODES, [(MODE,)] * 2, TORQUE, [(LIMIT,)] * 2), watches_torque=watches_torque, fast=False
+    )
+    times = []
+    for number in range(2000):
+        now = 0.005 * number
+        servos: dict[int, list[Answer]] = {
+            **{0: [(0, WATCHDOG, LIMIT, own) for own in SENT[-1]], 1: [(0, MODE)] * 2},
+            2: [(0, 1, 0)] * 2,
+        }
+        if back.kind == 2:
+            times.append(now)
+        back.look(servos[back.kind], SENT, now)
+    assert bool(times) is watches_torque
+    if watches_torque:
+        between = [after - before for before, after in itertools.pairwise(times)]
+        assert times[0] < 0.05 and min(between) >= 0.05 and max(between) < 0.17
+        assert sum(between) / len(between) == pytest.approx(0.11, rel=0.1)
+
+
+def test_a_lost_read_back_is_repeated_once_in_5_ms_if_that_takes_less_than_half_of_a_short_cycle() -> None:
+    def may(interval: float, *times: float, takes: float = 0.001) -> list[bool]:
+        spans = (1, 2), GOALS, MODES, [(MODE,)] * 2, TORQUE, [(LIMIT,)] * 2
+        back = ReadBack(*spans, interval=interval, fast=False)
+        return [back.may_repeat(now, takes) for now in times]
+
+    assert may(0.004, 1.0, 1.0049, 1.0051, 1.0099) == [True, False, True, False]
+    assert may(0.004, 0.0, takes=0.0019) == [True] and may(0.004, 0.0, takes=0.0021) == [False]
+    assert may(0.005, 0.0) == [True] and may(0.0051, 0.0) == [False], (
+        "a delay of a long cycle leaves the arm unobserved"
+    )
