@@ -81,7 +81,7 @@ def test_a_servo_that_holds_the_goal_it_seemed_to_have_missed_answers_a_cycle_la
     assert wrong is not None and wrong[0] is cause and ("a cycle late" in wrong[1]) == (cause is Cause.STALE)
 
 
-@pytest.mark.parametrize(("held", "late"), [((0.03, 0.04), 4), ((0.03, 0.03), 0)])
+@pytest.mark.parametrize(("held", "late"), [((0.03, 0.04), 4), ((0.03, 0.03), 0), ((0.04, 0.03), 0)])
 def test_a_goal_held_later_than_it_was_sent_shows_how_late_replies_are(
     arm: Arm, held: Sequence[float], late: int
 ) -> None:

@@ -58,7 +58,7 @@ def test_velocities_are_false_if_they_are_reported_twice_or_add_up_to_several_st
 def test_the_latest_change_tells_whether_grease_may_still_be_warming_up(make: Make) -> None:
     """While friction warms up, the motion changes by at most 25 % from period to period."""
     stream, _, _ = make()
-    stream._correlation = lambda _: 0.95  # type: ignore[method-assign]
+    stream._correlation = lambda samples: 0.95  # type: ignore[method-assign]
     assert "while grease warms up" in stream._advice([0.9, 0.35, 0.3, 0.24], 8)
     assert "changes most" in stream._advice([0.9, 0.38, 0.32, 0.26], 8)
 
