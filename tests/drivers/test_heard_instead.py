@@ -75,6 +75,13 @@ def test_another_masters_instruction_as_long_as_a_reply_is_no_late_reply(data_by
     assert said(encode_status(1, 0, bytes(data_bytes))[:-1]).startswith("Replies did arrive, but too late")
 
 
+@pytest.mark.parametrize("kept", [4, 7, 8, 10])
+def test_a_refusal_that_breaks_off_is_no_instruction_of_another_master(kept: int) -> None:
+    cycles = exchange(Wire((encode_status(1, 7)[:kept] + answer(2, 4, 5, 6),)))
+    assert cycles.cycle([0, 0]).servos == [None, (0, 4, 5, 6)]
+    assert cycles.heard.strangers == 0
+
+
 @pytest.mark.parametrize(("ids", "fast"), [((2, 2), False), ((1, 1), False), ((2, 1), False), ((2, 2), True)])
 def test_a_reading_under_another_servos_id_is_no_reading(ids: tuple[int, int], fast: bool) -> None:
     fine, wrong = both(1, 2, fast=fast), both(*ids, fast=fast)
@@ -103,6 +110,7 @@ def test_damaged_ones_are(fast: bool) -> None:
 
 def test_nothing_is_said_of_silence_or_of_what_was_long_ago() -> None:
     assert said(b"") == said(FINE) == said(answer(1, 1, 2, 3)) == ""
+    assert said(12 * b"\x55" + FINE) == "", "every servo has answered"
     assert said(FINE[:-3] + b"abc", later_s=0.11) == said(both(7, 2, fast=False), later_s=0.11) == ""
     assert said(FINE[:-3] + b"abc", later_s=0.09) and said(both(7, 2, fast=False), later_s=0.09)
 
