@@ -177,7 +177,7 @@ def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:
     A master does not receive while it transmits: it hears only the part of a foreign packet that precedes its own.
     """
     for at, following in pairwise(_headers(received)):
-        if following - at >= _FRONT_SIZE and received[at + _FRONT_SIZE - 1] in _INSTRUCTIONS:
+        if received[at + _FRONT_SIZE - 1] in _INSTRUCTIONS:  # no byte of a header is an instruction
             length = int.from_bytes(received[at + 5 : at + 7], "little")
             if following - at < _BEFORE_LENGTH + length:
                 yield received[at + 4], length

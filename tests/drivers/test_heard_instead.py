@@ -75,6 +75,12 @@ def test_another_masters_instruction_as_long_as_a_reply_is_no_late_reply(data_by
     assert said(encode_status(1, 0, bytes(data_bytes))[:-1]).startswith("Replies did arrive, but too late")
 
 
+def test_an_instruction_that_breaks_off_behind_noise_is_another_masters() -> None:
+    cycles = exchange(Wire((b"\x55" * 15 + encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")[:12] + FINE,)))
+    assert cycles.cycle([0, 0]).servos == [(0, 1, 2, 3), (0, 4, 5, 6)]
+    assert cycles.heard.strangers == 1
+
+
 @pytest.mark.parametrize("kept", [4, 7, 8, 10])
 def test_a_refusal_that_breaks_off_is_no_instruction_of_another_master(kept: int) -> None:
     cycles = exchange(Wire((encode_status(1, 7)[:kept] + answer(2, 4, 5, 6),)))
@@ -142,7 +148,9 @@ def test_a_reply_that_was_still_arriving_when_time_was_up_is_late_not_damaged(ke
 
 @pytest.mark.parametrize("fast", [False, True])
 def test_so_is_the_beginning_of_a_reply_to_an_earlier_request(fast: bool) -> None:
-    """After a lost reply another number of bytes is asked for."""
+    """After a lost reply another number of bytes is asked for; stuffing does not count."""
+    stuffed = encode_status(1, 0, b"\xff\xff\xfd" + state(1, 2, 3)[3:])
+    assert len(stuffed) == 22 and said(b"", stuffed[:-1]).startswith("Replies did arrive, but too late or twice")
     assert said(b"", both(1, 2, fast=fast)[:-1], fast=fast).startswith("Replies did arrive, but too late or twice")
 
 
