@@ -23,7 +23,7 @@ class ReadBackExchange(Exchange):
     """An `Exchange` that also reads back goals, settings or Torque Enable once `add_read_back` has been called."""
 
     _read_back: ReadBack | None = None
-    _overtime = 0.0
+    _overtime: float
     """Longest time by which a read-back may delay the next cycle [s]; 0 if the status includes Torque Enable."""
 
     awaited_until = -math.inf

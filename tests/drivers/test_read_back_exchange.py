@@ -1,5 +1,6 @@
 """Read-backs between cycles on a scripted wire: when they take place, and what a lost or late one changes."""
 
+import math
 import struct
 
 import pytest
@@ -233,8 +234,70 @@ def test_an_overdue_read_back_may_take_up_most_of_the_next_cycle() -> None:
     assert back is not None
     due = wire.now() + 0.0002
     back.overdue_at = wire.now()
+    asked = back.read.request
+    assert cycles.awaited_until < wire.now()
     cycles.overruled(due)
-    assert wire.written and wire.now() == pytest.approx(due + 0.8 * 0.0025)
+    assert wire.written == [asked], "all servos are asked"
+    assert wire.now() == pytest.approx(due + 0.8 * 0.0025)
+    assert cycles.awaited_until == wire.now(), "the next cycle is late for this reason"
+
+
+def test_a_read_back_for_which_there_is_barely_time_may_be_a_little_late() -> None:
+    """By a fifth of a cycle; the modes take 0.72 ms on the wire."""
+    wire = Wire()
+    cycles = ready(wire, 0.0025)
+    began = wire.now()
+    cycles.overruled(began + 0.00075)
+    assert wire.now() == pytest.approx(began + 0.00072 + 0.2 * 0.0025)
+
+
+def reply_to(cycles: ReadBackExchange, *last: int) -> bytes:
+    """Replies to the next read-back: zeros, except for the last byte of each servo."""
+    assert cycles._read_back is not None
+    zeros = bytes(cycles._read_back.read.reply_size // 2 - 12)
+    return b"".join(encode_status(servo, 0, zeros + bytes((each,))) for servo, each in enumerate(last, 1))
+
+
+def test_a_read_back_in_time_delays_nothing_and_shows_when_the_modes_were_right() -> None:
+    wire = Wire()
+    cycles = ready(wire)
+    assert exchange(wire).modes_seen_ago == cycles.modes_seen_ago == math.inf
+    wire.answers = [reply_to(cycles, 0, 0)]
+    cycles.overruled(wire.now() + 0.0016)
+    seen_at = wire.now()
+    assert cycles.awaited_until == -math.inf
+    wire.time += 0.5
+    assert 0.5 <= cycles.modes_seen_ago == wire.now() - seen_at
+
+
+def test_a_foreign_mode_is_read_again_in_the_next_cycle_not_in_the_same() -> None:
+    wire = Wire()
+    cycles = ready(wire)
+    wire.answers = [reply_to(cycles, 0, 9)] * 2
+    assert cycles.overruled(wire.now() + 0.01) is None and len(wire.written) == 1
+    found = cycles.overruled(wire.now() + 0.01)
+    assert found is not None and found.place == 1 and len(wire.written) == 2
+
+
+def test_nothing_is_read_back_before_the_first_goals_or_without_being_prepared() -> None:
+    wire = Wire()
+    assert read_back_of(wire).overruled(1.0) is None
+    plain = exchange(wire)
+    plain.cycle([0, 0])
+    wire.written.clear()
+    assert plain.overruled(wire.now() + 1.0) is None and plain.read_torque() is None
+    assert not wire.written
+
+
+@pytest.mark.parametrize("is_late", [False, True])
+def test_torque_is_read_outside_a_cycle_unless_a_late_reply_may_be_on_its_way(is_late: bool) -> None:
+    wire = Wire()
+    cycles = ready(wire)
+    if is_late:
+        cycles.cycle([0, 0])  # no reply
+    wire.written.clear()
+    assert cycles.read_torque() is None
+    assert bool(wire.written) is not is_late
 
 
 def test_a_stall_during_a_read_back_does_not_prevent_the_next_one() -> None:
@@ -253,7 +316,7 @@ def test_a_stall_during_a_read_back_does_not_prevent_the_next_one() -> None:
     cycles.overruled(wire.now() + 0.01)
     wire.read = read  # type: ignore[method-assign]
     wire.written.clear()
-    cycles.overruled(wire.now() + 0.003)
+    cycles.overruled(wire.now() + 0.002)
     assert wire.written, "it is expected to take up to twice as long as one should"
 
 
