@@ -81,7 +81,10 @@ TESTS = {
         *("tests/drivers/test_heard_instead.py", "tests/drivers/test_exchange_cycles.py"),
         "tests/drivers/test_exchange.py",
     ],
-    "hil/drivers/others/read_back.py": ["tests/drivers/test_sightings.py", "tests/drivers/test_read_back.py"],
+    "hil/drivers/others/read_back.py": [
+        *("tests/drivers/test_sightings.py", "tests/drivers/test_read_back_exchange.py"),
+        "tests/drivers/test_read_back.py",
+    ],
     "hil/drivers/torque/switch.py": [
         *(f"tests/drivers/torque/test_{name}.py" for name in ("switch", "switch_times", "reports")),
         "tests/drivers/test_bus.py",
@@ -104,6 +107,10 @@ EQUIVALENT = {
     ("ARMS = 96", "96  ->  192"): "chain_watch: the size of the ensemble, of which only mean and covariance are used",
     ("towards = ", "self._was_above * 1.0  ->  self._was_above / 1.0"): "chain_watch: the same number",
     ("towards = ", "self._was_below * 1.0  ->  self._was_below / 1.0"): "chain_watch: the same number",
+    (
+        "approach, before = velocity * towards",
+        "velocity * towards  ->  velocity / towards",
+    ): "chain_watch: it is 1, -1 or, for joints that no end stop can block, 0",
     (
         "may_lie = ",
         "torque * self._falls_to  ->  torque / self._falls_to",

@@ -117,7 +117,7 @@ class ReadBack:
         limits: Sequence[Sequence[int]],
         *,
         watches_torque: bool = False,
-        interval: float = 0.0,
+        interval: float,
         fast: bool,
     ) -> None:
         kind = FastSyncRead if fast else SyncRead

@@ -23,7 +23,7 @@ LONG_AGO = 55
 
 
 def read_back() -> ReadBack:
-    return ReadBack((1, 2), GOALS, MODES, [(MODE,), (MODE,)], TORQUE, [(LIMIT,)] * 2, fast=False)
+    return ReadBack((1, 2), GOALS, MODES, [(MODE,), (MODE,)], TORQUE, [(LIMIT,)] * 2, interval=0.0, fast=False)
 
 
 def reads_modes(back: ReadBack) -> bool:
@@ -56,7 +56,7 @@ def test_the_second_foreign_goal_is_proof_the_third_of_one_that_lost_writes_may_
 def test_any_setting_that_changes_what_goals_and_angles_mean_is_compared(register: str) -> None:
     names = ("Drive Mode", "Operating Mode", "Homing Offset")
     spans = GOALS, Span.of([XM430] * 2, ("ID", *names)), [(0, 0, -84), (4, 3, 0)], TORQUE, [(LIMIT,)] * 2
-    back = ReadBack((1, 2), *spans, fast=False)
+    back = ReadBack((1, 2), *spans, interval=0.0, fast=False)
     held = {name: value + 7 * (name == register) for name, value in zip(names, (4, 3, 0), strict=True)}
     for now, found in ((0.0, False), (0.01, True)):
         assert reads_modes(back)
@@ -136,6 +136,7 @@ def test_a_sighting_raises_doubts_for_a_while() -> None:
 @pytest.mark.parametrize(("goal", "is_unexpected"), [(OURS, False), (20, True), (FOREIGN, True)])
 def test_an_earlier_goal_than_the_latest_is_unexpected_though_not_foreign(goal: int, is_unexpected: bool) -> None:
     back = read_back()
+    assert not back.is_unexpected
     look(back, 1.0)
     for now in (1.001, 1.002):
         look(back, now, goal=goal)
@@ -219,12 +220,18 @@ def test_at_least_one_read_back_of_goals_follows_each_of_modes_and_four_in_doubt
         assert counts == {least, 99}
 
 
-@pytest.mark.parametrize(("delay", "least", "most"), [(0.0005, 0.025, 0.05), (0.002, 0.0375, 0.075)])
+@pytest.mark.parametrize(
+    ("delay", "in_doubt", "least", "most"),
+    [(0.0005, False, 0.025, 0.05), (0.002, False, 0.0375, 0.075), (0.002, True, 0.01, 0.02)],
+)
 def test_the_next_overdue_read_back_follows_the_sooner_the_shorter_the_delay(
-    delay: float, least: float, most: float
+    delay: float, in_doubt: bool, least: float, most: float
 ) -> None:
-    """After up to 100 times the delay, and at most 75 ms: at random, so that no other program escapes by its rhythm."""
+    """After up to 100 times the delay, 10 times if another program is suspected, and at most 75 ms: at random, so that
+    no other program escapes by its rhythm.
+    """
     back, pauses = read_back(), []
+    back.doubts_until = 1e3 if in_doubt else -math.inf
     for now in range(100):
         back.delayed(float(now), delay, alone=False)
         pauses.append(back.overdue_at - now)
@@ -234,8 +241,8 @@ def test_the_next_overdue_read_back_follows_the_sooner_the_shorter_the_delay(
 
 
 def test_the_shortest_read_is_that_of_one_goal_also_of_an_arm_with_one_servo() -> None:
-    one = ReadBack((1,), GOALS, MODES, [(MODE,)], TORQUE, [(LIMIT,)], fast=False)
-    assert one.shortest.reply_size == one.reads[0].reply_size
+    one = ReadBack((1,), GOALS, MODES, [(MODE,)], TORQUE, [(LIMIT,)], interval=0.0, fast=False)
+    assert one.shortest.reply_size == one.reads[0].reply_size and one.alone.reply_size == one.reads[1].reply_size
 
 
 @pytest.mark.parametrize("is_silent", [False, True])
@@ -253,7 +260,10 @@ def test_modes_are_confirmed_by_the_answers_of_all_servos(is_silent: bool) -> No
 @pytest.mark.parametrize("watches_torque", [False, True])
 def test_torque_is_read_back_ten_times_a_second_if_no_status_shows_it(watches_torque: bool) -> None:
     back = ReadBack(
-        *((1, 2), GOALS, MODES, [(MODE,)] * 2, TORQUE, [(LIMIT,)] * 2), watches_torque=watches_torque, fast=False
+        *((1, 2), GOALS, MODES, [(MODE,)] * 2, TORQUE, [(LIMIT,)] * 2),
+        watches_torque=watches_torque,
+        interval=0.0,
+        fast=False,
     )
     times = []
     for number in range(2000):
