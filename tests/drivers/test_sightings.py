@@ -293,3 +293,17 @@ def test_a_lost_read_back_is_repeated_once_in_5_ms_if_that_takes_less_than_half_
     assert may(0.005, 0.0) == [True] and may(0.0051, 0.0) == [False], (
         "a delay of a long cycle leaves the arm unobserved"
     )
+
+
+def test_a_read_back_is_overdue_75_ms_after_the_first_one_that_was_left_out() -> None:
+    back = read_back()
+    assert back.overdue_at == math.inf
+    back.postponed(1.0)
+    back.postponed(1.01)
+    assert back.overdue_at == pytest.approx(1.075)
+    back.delayed(1.08, 0.0, alone=True)
+    assert back.overdue_at == pytest.approx(1.075 + 0.075 / 2), "if only one of two was read, the other soon follows"
+    back.delayed(1.09, 0.0, alone=False)
+    assert back.overdue_at == pytest.approx(1.09 + 0.075)
+    back.delayed(1.0, 0.0, alone=True)
+    assert back.overdue_at == pytest.approx(1.0 + 0.075), "but never later than after the usual pause"
