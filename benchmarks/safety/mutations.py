@@ -126,6 +126,10 @@ EQUIVALENT = {
     ("abs(travels[-1].moved)", "-1  ->  +1"): "recent_motion: the last of two",
     ("self._states: deque[State]", "3  ->  6"): "recent_motion: more exchanges are kept than are used",
     ("low = max((each.low", "0.0  ->  1.0"): "recent_motion: without any travel, the upper end is 0 as well",
+    (
+        "waited = 0.0 if self._asked_at is None",
+        "0.0  ->  1.0",
+    ): "silence: a reply is missing only if it has been asked for",
     ("_NEVER = ", "62  ->  124"): "exchange: more cycles than any run has",
     ("AFTER_LOSS = 5", "5  ->  10"): "exchange: replies that are late by more cycles are recognised as well",
     (

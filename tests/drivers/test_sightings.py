@@ -307,3 +307,21 @@ def test_a_read_back_is_overdue_75_ms_after_the_first_one_that_was_left_out() ->
     assert back.overdue_at == pytest.approx(1.09 + 0.075)
     back.delayed(1.0, 0.0, alone=True)
     assert back.overdue_at == pytest.approx(1.0 + 0.075), "but never later than after the usual pause"
+
+
+@pytest.mark.parametrize("between", ["nothing", "silence", "collisions"])
+def test_only_read_backs_that_show_a_goal_count_when_three_of_six_are_missed(between: str) -> None:
+    """The goals missed are two read-backs apart that show nothing, or that show the latest goals."""
+    back, now = read_back(), 1.0
+    look(back, now)
+    own: list[Answer] = [(0, WATCHDOG, LIMIT, goal) for goal in SENT[-1]]
+    late: Answer = (0, WATCHDOG, LIMIT, SENT[-2][1])
+    for _ in range(3):
+        for servos, collided in (
+            ([own[0], late], False),
+            *2 * [([own[0], None] if between == "silence" else own, between == "collisions")],
+        ):
+            now += 1e-4
+            assert not reads_modes(back)
+            back.look(servos, SENT, now, collided=collided)
+    assert (back.lost is not None) is (between != "nothing")
