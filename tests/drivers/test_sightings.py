@@ -311,7 +311,7 @@ def test_a_read_back_is_overdue_75_ms_after_the_first_one_that_was_left_out() ->
 
 @pytest.mark.parametrize("between", ["nothing", "silence", "collisions"])
 def test_only_read_backs_that_show_a_goal_count_when_three_of_six_are_missed(between: str) -> None:
-    """The goals missed are two read-backs apart that show nothing, or that show the latest goals."""
+    """Between two missed goals there are two read-backs, which show nothing or the latest goals."""
     back, now = read_back(), 1.0
     look(back, now)
     own: list[Answer] = [(0, WATCHDOG, LIMIT, goal) for goal in SENT[-1]]
