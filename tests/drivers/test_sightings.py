@@ -325,3 +325,12 @@ def test_only_read_backs_that_show_a_goal_count_when_three_of_six_are_missed(bet
             assert not reads_modes(back)
             back.look(servos, SENT, now, collided=collided)
     assert (back.lost is not None) is (between != "nothing")
+
+
+@pytest.mark.parametrize(("limit", "goals"), [(LIMIT, (FOREIGN, FOREIGN)), (LIMIT - 1, (SENT[-1][0], OURS))])
+def test_a_program_that_writes_to_every_servo_is_found_as_well(limit: int, goals: tuple[int, int]) -> None:
+    back = read_back()
+    look(back, 1.0)
+    servos: list[Answer] = [(0, WATCHDOG, limit, goal) for goal in goals]
+    found = [back.look(servos, SENT, 1.0 + 1e-4 * number) for number in range(2)]
+    assert found[0] is None and found[1] is not None and found[1].place == 0
