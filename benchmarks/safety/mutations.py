@@ -136,6 +136,7 @@ EQUIVALENT = {
         "self._goals_since = 0",
         "0  ->  1",
     ): "read_back: the first read-back, which is of modes, sets it",
+    ("if not answer or answer[0] or", "0  ->  1"): "read_back: the faster of two ways is hardly ever taken",
     ("self._looks = [0]", "0  ->  1"): "read_back: only differences of these counts matter",
     ("self.place = (", "self.place + 1  ->  self.place - 1"): "read_back: the servos take turns in either order",
     ("self._cycles = 0", "0  ->  1"): "status_check: of the goals sent before the first agreement, one more is known",

@@ -334,3 +334,16 @@ def test_a_program_that_writes_to_every_servo_is_found_as_well(limit: int, goals
     servos: list[Answer] = [(0, WATCHDOG, limit, goal) for goal in goals]
     found = [back.look(servos, SENT, 1.0 + 1e-4 * number) for number in range(2)]
     assert found[0] is None and found[1] is not None and found[1].place == 0
+
+
+@pytest.mark.parametrize(("goal", "goals"), [(OURS, 0), (LONG_AGO, 3)])
+def test_modes_that_are_due_are_read_between_sightings_that_are_far_from_proof(goal: int, goals: int) -> None:
+    """Four read-backs of goals come before them, including the one that raised the doubts; without doubts, one."""
+    back = read_back()
+    look(back, 0.0)
+    look(back, 1.0, goal=goal)
+    count = 0
+    while not reads_modes(back):
+        count += 1
+        look(back, 1.0 + 1e-3 * count)
+    assert count == goals
