@@ -71,7 +71,7 @@ TESTS = {
     ],
     "hil/drivers/exchange.py": [
         *("tests/drivers/test_exchange_cycles.py", "tests/drivers/test_heard_instead.py"),
-        "tests/drivers/test_exchange.py",
+        *("tests/drivers/test_exchange.py", "tests/drivers/test_read_back_exchange.py"),
     ],
     "hil/drivers/read_back_exchange.py": [
         *("tests/drivers/test_read_back_exchange.py", "tests/drivers/test_exchange_cycles.py"),
@@ -137,6 +137,8 @@ EQUIVALENT = {
         "0  ->  1",
     ): "read_back: the first read-back, which is of modes, sets it",
     ("if not answer or answer[0] or", "0  ->  1"): "read_back: the faster of two ways is hardly ever taken",
+    ("REMEMBERED = 128", "128  ->  256"): "exchange: older goals are hardly ever held",
+    ("_LONGEST_REPLY = ", "1024  ->  2048"): "exchange: longer than any reply",
     ("self._looks = [0]", "0  ->  1"): "read_back: only differences of these counts matter",
     ("self.place = (", "self.place + 1  ->  self.place - 1"): "read_back: the servos take turns in either order",
     ("self._cycles = 0", "0  ->  1"): "status_check: of the goals sent before the first agreement, one more is known",
