@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from hil.drivers.exchange import Exchange
 from hil.drivers.others.read_back import TRY_AGAIN_S
-from hil.drivers.packet import encode_status
+from hil.drivers.packet import Framer, encode_status
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import spans, status_span
 from hil.drivers.turns import Turns
@@ -165,3 +165,22 @@ def test_spans_are_due_as_if_every_cycle_counted_down_to_each_of_them(
             assert read == 3
         else:
             assert read == 0
+
+
+class Echoing(Wire):
+    """An adapter that echoes what is sent; of the first reply, it delivers as much as makes a reply with the echo."""
+
+    echoes = True
+
+    def write(self, data: bytes) -> None:
+        self.written.append(data)
+        size = list(Framer().feed(data))[-1].body[2]
+        reply = encode_status(1, 0, bytes(size)) + encode_status(2, 0, bytes(size))
+        self.waiting += data + (reply if len(self.written) > 1 else reply[: len(reply) - len(data)])
+
+
+def test_an_echo_and_a_part_of_a_reply_that_are_as_long_as_a_reply_do_not_show_that_echoes_have_ended() -> None:
+    cycles = exchange(Echoing())
+    assert cycles.cycle([7, 8]).servos == [None, None]
+    for _ in range(3):
+        assert cycles.cycle([7, 8]).servos == [(0, 0, 0, 0)] * 2
