@@ -12,7 +12,7 @@ from hil.drivers.packet import Framer, encode_status
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import spans, status_span
 from hil.drivers.turns import Turns
-from tests.drivers.test_exchange import XM430, Wire, answer, exchange
+from tests.drivers.test_exchange import XM430, Wire, answer, asked, exchange
 from tests.drivers.test_read_back_exchange import read_back_of
 
 FINE = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
@@ -184,3 +184,13 @@ def test_an_echo_and_a_part_of_a_reply_that_are_as_long_as_a_reply_do_not_show_t
     assert cycles.cycle([7, 8]).servos == [None, None]
     for _ in range(3):
         assert cycles.cycle([7, 8]).servos == [(0, 0, 0, 0)] * 2
+
+
+def test_from_a_certain_cycle_on_replies_may_be_awaited_longer() -> None:
+    wire = Wire([b""])
+    cycles = exchange(wire)
+    before = cycles.patience
+    cycles.wait_longer(0.005)
+    assert cycles.patience == pytest.approx(before + 0.005)
+    cycles.cycle([0, 0])
+    assert asked(wire) == [10] and before < wire.time <= cycles.patience and wire.time > 0.005

@@ -14,6 +14,7 @@ from hil.drivers.state import read_back_spans
 from hil.drivers.sync_read import Span, one_each
 from hil.drivers.turns import Turns
 from tests.drivers.test_exchange import XM430, Wire, answer, echoed, exchange
+from tests.drivers.test_exchange import asked as bytes_asked
 
 ONE_READ_BACK_S = 0.004
 """Time before a cycle that suffices for one read-back, but not for modes and goals."""
@@ -298,6 +299,16 @@ def test_torque_is_read_outside_a_cycle_unless_a_late_reply_may_be_on_its_way(is
     wire.written.clear()
     assert cycles.read_torque() is None
     assert bool(wire.written) is not is_late
+    cycles.cycle([0, 0])
+    wire.written.clear()
+    cycles.cycle([0, 0])
+    assert cycles._late_possible, "neither cycle was answered"
+    longer = [encode_status(servo, 0, bytes(bytes_asked(wire)[-1] + 1)) for servo in (1, 2)]
+    wire.answers = [b"".join(longer)]
+    assert None not in cycles.cycle([0, 0]).servos
+    wire.written.clear()
+    cycles.read_torque()
+    assert wire.written, "the latest reply was in time"
 
 
 def test_a_stall_during_a_read_back_does_not_prevent_the_next_one() -> None:
