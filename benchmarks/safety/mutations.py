@@ -137,6 +137,10 @@ EQUIVALENT = {
         "0  ->  1",
     ): "read_back: the first read-back, which is of modes, sets it",
     ("if not answer or answer[0] or", "0  ->  1"): "read_back: the faster of two ways is hardly ever taken",
+    (
+        "plan = self._usual if left >= 0",
+        "0  ->  1",
+    ): "exchange: which registers are due is asked a cycle early, and none are",
     ("REMEMBERED = 128", "128  ->  256"): "exchange: older goals are hardly ever held",
     ("_LONGEST_REPLY = ", "1024  ->  2048"): "exchange: longer than any reply",
     ("self._looks = [0]", "0  ->  1"): "read_back: only differences of these counts matter",
