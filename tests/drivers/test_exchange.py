@@ -202,6 +202,7 @@ def test_a_stuffed_answer_is_understood() -> None:
     wire = Wire([answer(1, -1, 0xFD, 7) + answer(2, 1, 2, 3)])
     assert b"\xff\xff\xfd\xfd" in wire.answers[0]
     assert exchange(wire).cycle([0, 0]).servos == [(0, -1, 0xFD, 7), (0, 1, 2, 3)]
+    assert wire.time < 1e-3, "once it is complete, no further byte is awaited"
 
 
 @pytest.mark.parametrize("fast", [False, True])
