@@ -141,6 +141,7 @@ EQUIVALENT = {
         "plan = self._usual if left >= 0",
         "0  ->  1",
     ): "exchange: which registers are due is asked a cycle early, and none are",
+    ("self.fields += [ids[place]", "0  ->  1"): "exchange: a goal takes its place before it is sent",
     ("REMEMBERED = 128", "128  ->  256"): "exchange: older goals are hardly ever held",
     ("_LONGEST_REPLY = ", "1024  ->  2048"): "exchange: longer than any reply",
     ("self._looks = [0]", "0  ->  1"): "read_back: only differences of these counts matter",
