@@ -137,6 +137,7 @@ EQUIVALENT = {
         "0  ->  1",
     ): "read_back: the first read-back, which is of modes, sets it",
     ("if not answer or answer[0] or", "0  ->  1"): "read_back: the faster of two ways is hardly ever taken",
+    ("if not answer or answer[0] or", "2  ->  4"): "read_back: the faster of two ways is never taken",
     (
         "plan = self._usual if left >= 0",
         "0  ->  1",
