@@ -184,6 +184,7 @@ def test_an_echo_and_a_part_of_a_reply_that_are_as_long_as_a_reply_do_not_show_t
     assert cycles.cycle([7, 8]).servos == [None, None]
     for _ in range(3):
         assert cycles.cycle([7, 8]).servos == [(0, 0, 0, 0)] * 2
+    assert cycles.heard.strangers == 0, "its own packets are not another program's"
 
 
 def test_from_a_certain_cycle_on_replies_may_be_awaited_longer() -> None:
