@@ -14,7 +14,6 @@ import math
 import struct
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -178,10 +177,8 @@ class Exchange:
 
     def wait_longer(self, seconds: float) -> None:
         """From now on, wait this much longer [s] for missing replies, which may merely be late."""
-        is_usual = self._latest_plan is self._usual
-        self._plans = [replace(plan, reply_time=self._longer(plan, seconds)) for plan in self._plans]
+        self._plans = [plan._replace(reply_time=self._longer(plan, seconds)) for plan in self._plans]
         self._usual = self._plans[0]
-        self._latest_plan = self._usual if is_usual else self._latest_plan
 
     def _longer(self, plan: "_Plan", seconds: float) -> ReplyTime:
         return self._port.reply_time(plan.reply_time.timeout + seconds, self._sent_bytes(plan.read))
@@ -349,8 +346,7 @@ class Exchange:
         return self._sent_bytes(read) + read.reply_size
 
 
-@dataclass(frozen=True)
-class _Plan:
+class _Plan(NamedTuple):
     """One of the group reads of an exchange.
 
     span: index of the span, as given in a Reply. reply_time: how long to wait for the replies. pack_behind: function

@@ -23,7 +23,7 @@ class ReadBackExchange(Exchange):
     """An `Exchange` that also reads back goals, settings or Torque Enable once `add_read_back` has been called."""
 
     _read_back: ReadBack | None = None
-    _overtime = 0.0
+    _overtime: float
     """Longest time by which a read-back may delay the next cycle [s]; 0 if the status includes Torque Enable."""
 
     awaited_until = -math.inf
@@ -152,7 +152,7 @@ class ReadBackExchange(Exchange):
                 back.kind = GOALS  # they take less time to read; the other registers remain due
                 return self._held(back, due)
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
-            left_less_time = self._latest_plan is not self._usual
+            left_less_time = self._latest_plan.read is not self._usual.read
             self.read_back_at = now if self._late_possible or left_less_time else now + TRY_AGAIN_S
             return None
         port.clock.wait_until(due - takes - HOST_S)

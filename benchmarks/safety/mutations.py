@@ -34,7 +34,11 @@ PATIENCE_S = 300
 _EXPERIMENT = "tests/hil/experiment"
 TESTS = {
     "hil/experiment/guard.py": [
-        *(f"{_EXPERIMENT}/{name}" for name in ("test_guard.py", "test_held_at_rest.py", "test_status_check.py")),
+        *(
+            f"{_EXPERIMENT}/{name}"
+            for name in ("test_guard.py", "test_guard_silence.py", "checks/test_joint_faults.py")
+        ),
+        *(f"{_EXPERIMENT}/{name}" for name in ("test_held_at_rest.py", "test_status_check.py", "checks/test_apart.py")),
         f"{_EXPERIMENT}/stops",
     ],
     "hil/experiment/command_limits.py": [f"{_EXPERIMENT}/test_command_limits.py", f"{_EXPERIMENT}/test_guard.py"],
@@ -57,18 +61,21 @@ TESTS = {
     "hil/experiment/status_check.py": [f"{_EXPERIMENT}/test_status_check.py"],
     "hil/experiment/repetition.py": [f"{_EXPERIMENT}/test_repetition.py"],
     "hil/experiment/deadlines.py": [f"{_EXPERIMENT}/test_deadlines.py"],
+    "hil/experiment/silence.py": [
+        *(f"{_EXPERIMENT}/{name}" for name in ("test_deadlines.py", "test_guard_silence.py", "test_guard.py"))
+    ],
     "hil/experiment/stop_request.py": [f"{_EXPERIMENT}/test_stop_request.py"],
     "hil/plan/silence.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/plan/brake.py": ["tests/hil/plan/test_brake.py"],
     "hil/plan/recent_motion.py": ["tests/hil/plan/test_recent_motion.py", "tests/hil/plan/test_brake.py"],
     "hil/experiment/pace.py": [f"{_EXPERIMENT}/stream/test_stream_schedule.py"],
     "hil/experiment/stream.py": [
-        f"{_EXPERIMENT}/stream/test_stream_schedule.py",
+        *(f"{_EXPERIMENT}/stream/test_stream_{name}.py" for name in ("schedule", "findings")),
         *(f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/stops"),
     ],
     "hil/drivers/exchange.py": [
         *("tests/drivers/test_exchange_cycles.py", "tests/drivers/test_heard_instead.py"),
-        "tests/drivers/test_exchange.py",
+        *("tests/drivers/test_exchange.py", "tests/drivers/test_read_back_exchange.py"),
     ],
     "hil/drivers/read_back_exchange.py": [
         *("tests/drivers/test_read_back_exchange.py", "tests/drivers/test_exchange_cycles.py"),
@@ -78,9 +85,12 @@ TESTS = {
         *("tests/drivers/test_heard_instead.py", "tests/drivers/test_exchange_cycles.py"),
         "tests/drivers/test_exchange.py",
     ],
-    "hil/drivers/others/read_back.py": ["tests/drivers/test_sightings.py", "tests/drivers/test_read_back.py"],
+    "hil/drivers/others/read_back.py": [
+        *("tests/drivers/test_sightings.py", "tests/drivers/test_read_back_exchange.py"),
+        "tests/drivers/test_read_back.py",
+    ],
     "hil/drivers/torque/switch.py": [
-        *("tests/drivers/torque/test_switch.py", "tests/drivers/torque/test_reports.py"),
+        *(f"tests/drivers/torque/test_{name}.py" for name in ("switch", "switch_times", "reports")),
         "tests/drivers/test_bus.py",
     ],
     "hil/drivers/torque/off.py": [
@@ -134,6 +144,10 @@ EQUIVALENT = {
     ("towards = ", "self._was_above * 1.0  ->  self._was_above / 1.0"): "chain_watch: the same number",
     ("towards = ", "self._was_below * 1.0  ->  self._was_below / 1.0"): "chain_watch: the same number",
     (
+        "approach, before = velocity * towards",
+        "velocity * towards  ->  velocity / towards",
+    ): "chain_watch: it is 1, -1 or, for joints that no end stop can block, 0",
+    (
         "may_lie = ",
         "torque * self._falls_to  ->  torque / self._falls_to",
     ): "chain_watch: it is 1, -1 or 0",
@@ -142,13 +156,35 @@ EQUIVALENT = {
         "self._was_irregular = False",
         "False  ->  True",
     ): "guard: after a regular exchange, one more is processed like an irregular one",
+    ("if volt > 0.0 and", "0.0  ->  1.0"): "guard: no servo runs on 1 V",
     ("for _ in range(0, self._plan.end_samples", "0  ->  1"): "stream: a multiple of the window has as many steps",
     ("ticks.wait() if number else", "0.0  ->  1.0"): "stream: a value that is not used",
     ("abs(travels[-1].moved)", "-1  ->  +1"): "recent_motion: the last of two",
     ("self._states: deque[State]", "3  ->  6"): "recent_motion: more exchanges are kept than are used",
     ("low = max((each.low", "0.0  ->  1.0"): "recent_motion: without any travel, the upper end is 0 as well",
+    (
+        "waited = 0.0 if self._asked_at is None",
+        "0.0  ->  1.0",
+    ): "silence: a reply is missing only if it has been asked for",
     ("_NEVER = ", "62  ->  124"): "exchange: more cycles than any run has",
-    ("self._modes_due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: the first comparison sets it",
+    ("AFTER_LOSS = 5", "5  ->  10"): "exchange: replies that are late by more cycles are recognised as well",
+    (
+        "self._goals_since = 0",
+        "0  ->  1",
+    ): "read_back: the first read-back, which is of modes, sets it",
+    ("if not answer or answer[0] or", "0  ->  1"): "read_back: the faster of two ways is hardly ever taken",
+    ("if not answer or answer[0] or", "2  ->  4"): "read_back: the faster of two ways is never taken",
+    (
+        "plan = self._usual if left >= 0",
+        "0  ->  1",
+    ): "exchange: which registers are due is asked a cycle early, and none are",
+    ("self.fields += [ids[place]", "0  ->  1"): "exchange: a goal takes its place before it is sent",
+    ("REMEMBERED = 128", "128  ->  256"): "exchange: older goals are hardly ever held",
+    ("_LONGEST_REPLY = ", "1024  ->  2048"): "exchange: longer than any reply",
+    ("self._looks = [0]", "0  ->  1"): "read_back: only differences of these counts matter",
+    ("self.place = (", "self.place + 1  ->  self.place - 1"): "read_back: the servos take turns in either order",
+    ("self._cycles = 0", "0  ->  1"): "status_check: of the goals sent before the first agreement, one more is known",
+    ("self._agreed_at = [0]", "0  ->  1"): "status_check: of the goals sent before the first agreement, all are known",
     (
         "self._clock = [",
         "0.0  ->  1.0",

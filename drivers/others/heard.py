@@ -1,7 +1,9 @@
 """Unexpected bytes received in addition to the requested replies or instead of them, and advice for the user."""
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 
 from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction, Packet
 from hil.drivers.sync_read import Answer, GroupRead
@@ -155,20 +157,18 @@ def _packets_within(received: bytes) -> list[Packet]:
         end = at + _BEFORE_LENGTH + int.from_bytes(received[at + 5 : at + 7], "little")
         packets = list(Framer().feed(received[at:end])) if end <= len(received) else []
         found += packets
-        at = received.find(HEADER, end if packets else at + 1)
+        at = received.find(HEADER, end if packets else at + len(HEADER))
     return found
 
 
 def _fronts_of_replies(received: bytes) -> Iterator[tuple[int, int]]:
     """Yield the ID and number of data bytes, without stuffing, of each status packet, complete or not."""
-    at = received.find(HEADER)
-    while at >= 0:
+    for at in _headers(received):
         front = received[at : at + _FRONT_SIZE]
         if len(front) == _FRONT_SIZE and front[-1] == Instruction.STATUS:
             length = int.from_bytes(front[5:7], "little")
             stuffed = received.count(b"\xff\xff\xfd\xfd", at, at + _BEFORE_LENGTH + length)
             yield front[4], length - stuffed - _BESIDE_DATA
-        at = received.find(HEADER, at + 1)
 
 
 def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:
@@ -176,10 +176,13 @@ def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:
 
     A master does not receive while it transmits: it hears only the part of a foreign packet that precedes its own.
     """
-    at = received.find(HEADER)
-    while (following := received.find(HEADER, at + len(HEADER))) >= 0:
-        if following - at >= _FRONT_SIZE and received[at + _FRONT_SIZE - 1] in _INSTRUCTIONS:
+    for at, following in pairwise(_headers(received)):
+        if received[at + _FRONT_SIZE - 1] in _INSTRUCTIONS:  # no byte of a header is an instruction
             length = int.from_bytes(received[at + 5 : at + 7], "little")
             if following - at < _BEFORE_LENGTH + length:
                 yield received[at + 4], length
-        at = following
+
+
+def _headers(received: bytes) -> Iterator[int]:
+    """Yield the index of each header in the received bytes."""
+    return (found.start() for found in re.finditer(re.escape(HEADER), received))

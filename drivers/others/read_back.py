@@ -117,7 +117,7 @@ class ReadBack:
         limits: Sequence[Sequence[int]],
         *,
         watches_torque: bool = False,
-        interval: float = 0.0,
+        interval: float,
         fast: bool,
     ) -> None:
         kind = FastSyncRead if fast else SyncRead
@@ -139,7 +139,7 @@ class ReadBack:
         """Index of the servo to read if there is only time for one."""
         self.modes_seen_at = -math.inf
         """Time of the latest read-back that found the expected settings in every servo [s]."""
-        self._due = {MODES: -math.inf} | ({TORQUE: -math.inf} if watches_torque else {})
+        self._due = dict.fromkeys((MODES, TORQUE) if watches_torque else (MODES,), -math.inf)
         """Times at which the registers other than goals are due [s]."""
         self._goals_since = 0
         self._was_of_goals = False
@@ -231,7 +231,8 @@ class ReadBack:
         of_modes = self.kind == MODES
         self._was_of_goals = self.kind == GOALS
         self.place = (self.place + 1) % len(servos) if alone else 0
-        if self._was_of_goals and not alone and self._are_latest(servos, sent[-1]):
+        if self._was_of_goals and not alone and (watchdogs := self._if_latest(servos, sent[-1])):
+            self.watchdogs = watchdogs
             self._looks = [looks + (not collided) for looks in self._looks]
             self.is_unexpected = False
             self._choose_next(now)
@@ -271,15 +272,14 @@ class ReadBack:
             self._choose_next(now)
         return None
 
-    def _are_latest(self, servos: Sequence[Answer], goals: Sequence[int]) -> bool:
-        """Return whether all servos hold their latest goals and report no error."""
+    def _if_latest(self, servos: Sequence[Answer], goals: Sequence[int]) -> list[tuple[int, int]]:
+        """Return `watchdogs` if all servos hold their latest goals and report no error; otherwise nothing."""
         watchdogs: list[tuple[int, int]] = []
         for answer, goal, limits in zip(servos, goals, self._limits, strict=True):
             if not answer or answer[0] or answer[-1] != goal or answer[2:-1] != limits:
-                return False
+                return []
             watchdogs.append((len(watchdogs), answer[1]))
-        self.watchdogs = watchdogs
-        return True
+        return watchdogs
 
     def _choose_next(self, now: float) -> None:
         """Choose what to read next. Modes are read even while a foreign goal is suspected, since that goal may be the

@@ -119,7 +119,7 @@ class TorqueSwitch:
         if not 1 <= ticks <= 127:
             raise ValueError(f"watchdog must be 0.02 to 2.54 s, not {watchdog}")
         self._watchdog = watchdog
-        self.port.late_replies, self.port.growth = 0, 1
+        self.port.growth = 1
         for joint, servo in self._servos.items():
             watched = joint not in self._without_watchdog
             if watched:
@@ -135,7 +135,7 @@ class TorqueSwitch:
                 servo.write("Torque Enable", 1)
             except ServoRefused:
                 if servo.hardware_error() != HardwareError(0):
-                    raise ServoFault(self._fault(joint)) from None
+                    raise ServoFault(self._fault(joint, its_own=True)) from None
                 raise
 
     def torque_off(self) -> TorqueOff:
@@ -232,7 +232,7 @@ class TorqueSwitch:
         self.torque_off_report = report.with_later(drive, rebooted=rebooted)
         return True
 
-    def _fault(self, drive: Joint, *, its_own: bool = True) -> str:
+    def _fault(self, drive: Joint, *, its_own: bool) -> str:
         """Return the message for a servo's fault, or "" if it reports no fault and the alert came from another servo.
 
         its_own: whether this servo itself has raised the alert.

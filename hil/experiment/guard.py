@@ -29,7 +29,7 @@ from hil.experiment.checks.joint_faults import JointFaults
 from hil.experiment.command_limits import CommandLimits
 from hil.experiment.deadlines import Deadlines
 from hil.experiment.held_at_rest import HeldAtRest
-from hil.experiment.silence import LATE_WAKE_UP_S, Silence
+from hil.experiment.silence import Silence
 from hil.experiment.status_check import OLD_REPLIES, TORQUE_LOST, StatusCheck
 from hil.plan.find_torque import how_to_find_torque
 from hil.plan.recent_motion import RecentMotion
@@ -108,8 +108,6 @@ class Guard:
         """The latest exchanges, including those made while the arm is being stopped."""
         self._silence = Silence(config, interval, patience, lowers_since)
         self._patience = patience or float("inf")
-        self._late_after = self._patience + LATE_WAKE_UP_S
-        """An exchange that takes longer than this [s] shows that this computer is busy."""
         self._heard_instead = heard_instead
         self._deadlines = Deadlines(config, heard_instead, any_share=is_lowering)
         self._longest_gap = safety.watchdog
@@ -156,7 +154,7 @@ class Guard:
             self._status.longest_gap = gap
         if gap >= self._longest_gap:
             self._deadlines.check_gap(gap)
-        if took >= self._late_after:
+        if took > self._patience:
             self._silence.woke_up(now, took - self._patience)
         if took < self._shortest:
             self._shortest = took
@@ -324,9 +322,6 @@ class Guard:
         )
 
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
-        joint = self._joints[index]
-        if self._missing[index] == 0 and isnan(joint["position"]):
-            joint["seen_at"] = now
         # An error with a valid checksum is an answer, not a lost packet: one is enough, unless it reports that the
         # request was damaged.
         refused = bool(error) and error != StatusError.CRC

@@ -44,7 +44,7 @@ class Silence:
         self._alone = self._limit if heard_at is None else bridged_alone_limit(config)
         self._already = heard_at is not None
         self._asked_at = heard_at
-        self._turn = 0.0
+        self._turn: float
         self._last_heard = [-inf if heard_at is None else heard_at] * count
         self._all_heard_at = -inf
         self._listened = [0.0] * count

@@ -8,6 +8,7 @@ registers are read back several times per 0.1 s (hil.drivers.bus), so each of th
 from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import islice
+from math import nan, remainder
 
 from hil.config.schema import Config
 from hil.drivers.others.foreign_values import ForeignValues
@@ -19,6 +20,10 @@ from hil.drivers.state import Status
 from hil.errors import Cause
 
 _WRAP_S = 32.768
+"""Period after which a servo's clock starts again [s]. Of two clocks' readings, the difference is thus known up to
+multiples of it.
+"""
+
 _CLOCK_TOLERANCE_S = 0.004
 """Largest accepted lag of a servo's clock, which counts milliseconds, behind its expected value [s]."""
 
@@ -81,14 +86,13 @@ class StatusCheck:
         """Longest time so far for which this program has sent nothing [s]."""
         self._goals: deque[Sequence[float]] = deque(maxlen=_REMEMBERED)
         self._cycles = 0
-        # Per joint: goal in the latest status if it differs from that sent [A or V], the number of goals sent when they
-        # last agreed, and whether a goal that this program did not send was seen since then.
-        self._held: list[float | None] = [None] * len(config.joints)
+        # Per joint: goal in the latest status if it differs from that sent [A or V], with the number of goals sent by
+        # then; the number of goals sent when they last agreed; and whether a goal that this program did not send was
+        # seen since then.
+        self._held: list[tuple[float, int] | None] = [None] * len(config.joints)
         self._agreed_at = [0] * len(config.joints)
         self._is_foreign = [False] * len(config.joints)
-        self._missed_at = [-1] * len(config.joints)
-        """Number of goals that had been sent when a joint's status last reported a different goal, by joint."""
-        self._ticks = [(-1.0, 0.0)] * len(config.joints)
+        self._ticks = [(nan, nan)] * len(config.joints)
         """Servo's and computer's clock readings in the latest status [s], by joint."""
         self._foreign = [ForeignValues() for _ in config.joints]
         """Reported goals that this program never sent, by joint."""
@@ -109,7 +113,8 @@ class StatusCheck:
 
     def other_goal(self, joint: int) -> float | None:
         """The goal in the joint's latest status [A or V] if it differs from the one sent; otherwise None."""
-        return self._held[joint]
+        held = self._held[joint]
+        return held and held[0]
 
     def look(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
         """Check a status reading; return the fault's cause and text, or None.
@@ -161,8 +166,7 @@ class StatusCheck:
             self._missed[joint] = 0
             self._held[joint], self._agreed_at[joint], self._is_foreign[joint] = None, self._cycles, False
             return None
-        former, self._held[joint] = self._held[joint], status.goal
-        missed_at, self._missed_at[joint] = self._missed_at[joint], self._cycles
+        former, self._held[joint] = self._held[joint], (status.goal, self._cycles)
         foreign = self._foreign[joint]
         if self._never_sent(joint, status.goal):
             self._is_foreign[joint] = True
@@ -171,7 +175,7 @@ class StatusCheck:
         self._missed[joint] += 1
         if self._missed[joint] < _GOALS_MISSED and not is_repeated:
             return None
-        if former is not None and (late := self._late(joint, status.goal, former, self._cycles - missed_at)):
+        if former is not None and (late := self._late(joint, status.goal, *former)):
             cycles = "a cycle" if late == 1 else f"{late} cycles"
             if not self._is_recent(joint, late):
                 return Cause.STALE, (
@@ -198,12 +202,13 @@ class StatusCheck:
         readings, stale = self._clock[joint][2:]
         return readings >= _LEARNT_READINGS and not stale and late * self._interval > 2 * _CLOCK_TOLERANCE_S
 
-    def _late(self, joint: int, held: float, former: float, ago: int) -> int:
+    def _late(self, joint: int, held: float, former: float, missed_at: int) -> int:
         """Return the smallest delay [cycles] of a servo's replies that explains its goals, 0 if none does.
 
-        held: the goal reported now [A or V]. former: the wrong goal reported `ago` cycles earlier [A or V]. Replies are
-        late if `held` had already been sent at that time.
+        held: the goal reported now [A or V]. former: the wrong goal reported before, when `missed_at` goals had been
+        sent [A or V]. Replies are late if `held` had already been sent at that time.
         """
+        ago = self._cycles - missed_at
         half = self._half_tick[joint]
         for cycles, goals in enumerate(reversed(self._goals)):
             is_held = abs(held - goals[joint]) < half
@@ -225,7 +230,7 @@ class StatusCheck:
 
         The halves of a two-servo joint's goal may differ in age, so nothing is known about their sum.
         """
-        if not self._goals or not self._has_one_servo[joint]:
+        if not self._has_one_servo[joint]:
             return False
         since = self._cycles - self._agreed_at[joint] + _HELD_BEFORE
         if since > _REMEMBERED:
@@ -244,7 +249,7 @@ class StatusCheck:
         offset = (tick - now) % _WRAP_S
         if readings == 0:
             behind = offset
-        ahead = _wrapped(offset - behind)
+        ahead = remainder(offset - behind, _WRAP_S)
         drifted = _CLOCK_DRIFT * (now - seen_at)
         if ahead < -_CLOCK_TOLERANCE_S - drifted or ahead > _REBOOTED_S:
             if readings < _LEARNT_READINGS:
@@ -271,7 +276,7 @@ class StatusCheck:
         """Whether this clock difference (servo minus computer) is that of another joint's servo."""
         return any(
             readings >= _LEARNT_READINGS
-            and abs(_wrapped(offset - behind)) <= _CLOCK_TOLERANCE_S + _CLOCK_DRIFT * (now - seen_at)
+            and abs(remainder(offset - behind, _WRAP_S)) <= _CLOCK_TOLERANCE_S + _CLOCK_DRIFT * (now - seen_at)
             for other, (behind, seen_at, readings, _) in enumerate(self._clock)
             if other != joint
         )
@@ -282,8 +287,3 @@ def _unlike_armed(longer: int) -> str:
     if not longer:
         return "is no longer protected"
     return f"stops by itself {'later' if longer > 0 else 'earlier'} than intended"
-
-
-def _wrapped(seconds: float) -> float:
-    """Wrap a difference between two clocks to plus or minus half the wrap-around period of a servo's clock."""
-    return (seconds + 0.5 * _WRAP_S) % _WRAP_S - 0.5 * _WRAP_S

@@ -243,10 +243,10 @@ class Stream:
         moved = np.ptp(self._recorder.samples["position"][-window:], axis=0)
         speed = np.abs(self._recorder.samples["velocity"][-window:])
         fast = speed > self._config.safety.rest_velocity
-        distance = self._pace.interval * np.where(fast, speed, 0.0)[:-1].sum(axis=0)
+        earlier = self._pace.interval * np.where(fast, speed, 0.0)[:-2].sum(axis=0)
         for index, (joint, velocity, way) in enumerate(zip(self._bus.joints, state.velocity, moved, strict=True)):
             step = abs(joint.position_unit)
-            is_false = fast[-2:, index].all() or (fast[-1, index] and distance[index] > _FALSE_STEPS * step)
+            is_false = fast[-2:, index].all() or (fast[-1, index] and earlier[index] > _FALSE_STEPS * step)
             if is_false and way <= _STILL_STEPS * step:
                 raise SafetyStop(
                     f"{joint.title} reports a velocity of {velocity:.2f} rad/s before the start, but its position has "
@@ -323,7 +323,7 @@ class Stream:
     def _correlation(self, samples: int) -> float:
         """Correlation of the latest period's change with the previous change; each period has `samples` samples."""
         latest = self._recorder.samples["position"][-3 * samples :]
-        return correlation_of_changes(latest.reshape(3, samples, -1).transpose(0, 2, 1))
+        return correlation_of_changes(latest.reshape(3, samples, len(self._bus.joints)).transpose(0, 2, 1))
 
     def _check_motion(self, moved: Sequence[float]) -> None:
         """Detect, after a period, a joint held by friction or an obstacle, before more time is wasted."""

@@ -3,6 +3,7 @@
 import math
 import struct
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -78,12 +79,11 @@ def fast_answer(*servos: tuple[int, int, bytes]) -> bytes:
 
 
 def exchange(
-    wire: Wire, ids: Sequence[int] = (1, 2), *, fast: bool = False, one_write: bool = True
+    wire: Wire, ids: Sequence[int] = (1, 2), *, fast: bool = False, one_write: bool = True, interval: float = 0.0
 ) -> ReadBackExchange:
-    tables = [XM430] * len(ids)
-    every = spans(Mode.CURRENT, tables)
-    goal = XM430["Goal Current"]
-    return ReadBackExchange(wire, ids, goal, every, 0.0, fast=fast, one_write=one_write, slow_every=10)
+    every, goal = spans(Mode.CURRENT, [XM430] * len(ids)), XM430["Goal Current"]
+    how: dict[str, Any] = {"fast": fast, "one_write": one_write, "interval": interval, "slow_every": 10}
+    return ReadBackExchange(wire, ids, goal, every, 0.0, **how)
 
 
 # What is sent
@@ -202,6 +202,7 @@ def test_a_stuffed_answer_is_understood() -> None:
     wire = Wire([answer(1, -1, 0xFD, 7) + answer(2, 1, 2, 3)])
     assert b"\xff\xff\xfd\xfd" in wire.answers[0]
     assert exchange(wire).cycle([0, 0]).servos == [(0, -1, 0xFD, 7), (0, 1, 2, 3)]
+    assert wire.time < 1e-3, "once it is complete, no further byte is awaited"
 
 
 @pytest.mark.parametrize("fast", [False, True])

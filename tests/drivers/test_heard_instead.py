@@ -1,12 +1,14 @@
 """What is said of bytes that arrived instead of complete replies: damaged, late, or intact under another ID."""
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from hil.drivers.bus import ServoBus
-from hil.drivers.packet import encode_status
+from hil.drivers.bus import BusConfig, ServoBus
+from hil.drivers.errors import DriverError
+from hil.drivers.packet import Instruction, encode, encode_status
 from tests.drivers.test_exchange import Wire, answer, exchange, fast_answer, state
 
 FINE = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
@@ -42,6 +44,50 @@ def test_nor_are_two_replies_with_the_same_id(fast: bool) -> None:
     assert said(both(2, 2, fast=fast), fast=fast).startswith("Intact replies came from IDs 2, 2, although")
 
 
+def test_or_the_same_servos_in_another_order() -> None:
+    assert said(both(2, 1, fast=False)).startswith("Intact replies came from IDs 2, 1, although each servo was asked")
+    twice = answer(1, 1, 2, 3) + answer(1, 1, 2, 3) + b"noise"
+    assert said(twice).startswith("Intact replies came from IDs 1, 1, although each servo was asked once")
+
+
+@pytest.mark.parametrize(("count", "stops"), [(2, False), (3, True)])
+@pytest.mark.parametrize(
+    ("kind", "message"), [("strangers", "has sent or requested 3 packets"), ("mixed_up", "Intact")]
+)
+def test_two_foreign_packets_or_replies_under_other_ids_are_borne_and_three_are_not(
+    fake_config: Callable[..., BusConfig], kind: str, message: str, count: int, stops: bool
+) -> None:
+    """A late reply can look like one."""
+    with ServoBus.open(fake_config()) as bus:
+        setattr(bus.prepared.heard, kind, count)
+        if not stops:
+            bus.exchange([0.0, 0.0])
+            return
+        with pytest.raises(DriverError, match=message):
+            bus.exchange([0.0, 0.0])
+
+
+@pytest.mark.parametrize("data_bytes", [16, 21])
+def test_another_masters_instruction_as_long_as_a_reply_is_no_late_reply(data_bytes: int) -> None:
+    """The slow registers, which are read now and then, have 16 and 21 bytes."""
+    written = encode(1, Instruction.WRITE, bytes(data_bytes + 1))
+    assert not said(written).startswith("Replies did arrive, but too late")
+    assert said(encode_status(1, 0, bytes(data_bytes))[:-1]).startswith("Replies did arrive, but too late")
+
+
+def test_an_instruction_that_breaks_off_behind_noise_is_another_masters() -> None:
+    cycles = exchange(Wire((b"\x55" * 15 + encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")[:12] + FINE,)))
+    assert cycles.cycle([0, 0]).servos == [(0, 1, 2, 3), (0, 4, 5, 6)]
+    assert cycles.heard.strangers == 1
+
+
+@pytest.mark.parametrize("kept", [4, 7, 8, 10])
+def test_a_refusal_that_breaks_off_is_no_instruction_of_another_master(kept: int) -> None:
+    cycles = exchange(Wire((encode_status(1, 7)[:kept] + answer(2, 4, 5, 6),)))
+    assert cycles.cycle([0, 0]).servos == [None, (0, 4, 5, 6)]
+    assert cycles.heard.strangers == 0
+
+
 @pytest.mark.parametrize(("ids", "fast"), [((2, 2), False), ((1, 1), False), ((2, 1), False), ((2, 2), True)])
 def test_a_reading_under_another_servos_id_is_no_reading(ids: tuple[int, int], fast: bool) -> None:
     fine, wrong = both(1, 2, fast=fast), both(*ids, fast=fast)
@@ -70,7 +116,9 @@ def test_damaged_ones_are(fast: bool) -> None:
 
 def test_nothing_is_said_of_silence_or_of_what_was_long_ago() -> None:
     assert said(b"") == said(FINE) == said(answer(1, 1, 2, 3)) == ""
-    assert said(FINE[:-3] + b"abc", later_s=1.0) == said(both(7, 2, fast=False), later_s=1.0) == ""
+    assert said(12 * b"\x55" + FINE) == "", "every servo has answered"
+    assert said(FINE[:-3] + b"abc", later_s=0.11) == said(both(7, 2, fast=False), later_s=0.11) == ""
+    assert said(FINE[:-3] + b"abc", later_s=0.09) and said(both(7, 2, fast=False), later_s=0.09)
 
 
 def test_late_replies_are_called_late() -> None:
@@ -100,7 +148,10 @@ def test_a_reply_that_was_still_arriving_when_time_was_up_is_late_not_damaged(ke
 
 @pytest.mark.parametrize("fast", [False, True])
 def test_so_is_the_beginning_of_a_reply_to_an_earlier_request(fast: bool) -> None:
-    """After a lost reply another number of bytes is asked for."""
+    """After a lost reply another number of bytes is asked for; stuffing does not count."""
+    stuffed = encode_status(1, 0, b"\xff\xff\xfd" + state(1, 2, 3)[3:])
+    for noise in (b"", 10 * b"\x55"):
+        assert said(b"", noise + stuffed[:-1]).startswith("Replies did arrive, but too late or twice")
     assert said(b"", both(1, 2, fast=fast)[:-1], fast=fast).startswith("Replies did arrive, but too late or twice")
 
 

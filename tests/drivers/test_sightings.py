@@ -1,6 +1,7 @@
 """How many foreign values, in which time, prove that another program writes to a servo."""
 
 import itertools
+import math
 
 import pytest
 
@@ -22,7 +23,7 @@ LONG_AGO = 55
 
 
 def read_back() -> ReadBack:
-    return ReadBack((1, 2), GOALS, MODES, [(MODE,), (MODE,)], TORQUE, [(LIMIT,)] * 2, fast=False)
+    return ReadBack((1, 2), GOALS, MODES, [(MODE,), (MODE,)], TORQUE, [(LIMIT,)] * 2, interval=0.0, fast=False)
 
 
 def reads_modes(back: ReadBack) -> bool:
@@ -55,7 +56,7 @@ def test_the_second_foreign_goal_is_proof_the_third_of_one_that_lost_writes_may_
 def test_any_setting_that_changes_what_goals_and_angles_mean_is_compared(register: str) -> None:
     names = ("Drive Mode", "Operating Mode", "Homing Offset")
     spans = GOALS, Span.of([XM430] * 2, ("ID", *names)), [(0, 0, -84), (4, 3, 0)], TORQUE, [(LIMIT,)] * 2
-    back = ReadBack((1, 2), *spans, fast=False)
+    back = ReadBack((1, 2), *spans, interval=0.0, fast=False)
     held = {name: value + 7 * (name == register) for name, value in zip(names, (4, 3, 0), strict=True)}
     for now, found in ((0.0, False), (0.01, True)):
         assert reads_modes(back)
@@ -135,6 +136,7 @@ def test_a_sighting_raises_doubts_for_a_while() -> None:
 @pytest.mark.parametrize(("goal", "is_unexpected"), [(OURS, False), (20, True), (FOREIGN, True)])
 def test_an_earlier_goal_than_the_latest_is_unexpected_though_not_foreign(goal: int, is_unexpected: bool) -> None:
     back = read_back()
+    assert not back.is_unexpected
     look(back, 1.0)
     for now in (1.001, 1.002):
         look(back, now, goal=goal)
@@ -168,7 +170,8 @@ def test_goals_that_a_late_reply_may_have_destroyed_are_not_counted_as_missed(co
         now += 0.01
         goals: list[Answer] = [(0, WATCHDOG, LIMIT, goal) for goal in (SENT[-1][0], SENT[-2][1])]
         servos: list[Answer] = [(0, MODE)] * 2 if reads_modes(back) else goals
-        assert back.look(servos, SENT, now, collided=collided) is None
+        said = {"collided": True} if collided else {}
+        assert back.look(servos, SENT, now, **said) is None
     assert (back.lost is None) is collided and back.is_unexpected
 
 
@@ -215,3 +218,132 @@ def test_at_least_one_read_back_of_goals_follows_each_of_modes_and_four_in_doubt
                 goals += 1
             look(back, now)
         assert counts == {least, 99}
+
+
+@pytest.mark.parametrize(
+    ("delay", "in_doubt", "least", "most"),
+    [(0.0005, False, 0.025, 0.05), (0.002, False, 0.0375, 0.075), (0.002, True, 0.01, 0.02)],
+)
+def test_the_next_overdue_read_back_follows_the_sooner_the_shorter_the_delay(
+    delay: float, in_doubt: bool, least: float, most: float
+) -> None:
+    """After up to 100 times the delay, 10 times if another program is suspected, and at most 75 ms: at random, so that
+    no other program escapes by its rhythm.
+    """
+    back, pauses = read_back(), []
+    back.doubts_until = 1e3 if in_doubt else -math.inf
+    for now in range(100):
+        back.delayed(float(now), delay, alone=False)
+        pauses.append(back.overdue_at - now)
+    assert least <= min(pauses) < 1.1 * least and 0.95 * most < max(pauses) <= most
+    back.delayed(100.0, 0.0, alone=False)
+    assert back.overdue_at == pytest.approx(100.075), "without a delay it is not random"
+
+
+def test_the_shortest_read_is_that_of_one_goal_also_of_an_arm_with_one_servo() -> None:
+    one = ReadBack((1,), GOALS, MODES, [(MODE,)], TORQUE, [(LIMIT,)], interval=0.0, fast=False)
+    assert one.shortest.reply_size == one.reads[0].reply_size and one.alone.reply_size == one.reads[1].reply_size
+
+
+@pytest.mark.parametrize("is_silent", [False, True])
+def test_modes_are_confirmed_by_the_answers_of_all_servos(is_silent: bool) -> None:
+    back = read_back()
+    assert back.modes_seen_at == -math.inf and reads_modes(back)
+    back.look([(0, MODE), None if is_silent else (0, MODE)], SENT, 1.0)
+    assert back.modes_seen_at == (-math.inf if is_silent else 1.0)
+    while not reads_modes(back):
+        look(back, 2.0)
+    back.look([(0, MODE), (0, OTHER_MODE)], SENT, 3.0)
+    assert back.modes_seen_at == (-math.inf if is_silent else 1.0)
+
+
+@pytest.mark.parametrize("watches_torque", [False, True])
+def test_torque_is_read_back_ten_times_a_second_if_no_status_shows_it(watches_torque: bool) -> None:
+    back = ReadBack(
+        *((1, 2), GOALS, MODES, [(MODE,)] * 2, TORQUE, [(LIMIT,)] * 2),
+        watches_torque=watches_torque,
+        interval=0.0,
+        fast=False,
+    )
+    times = []
+    for number in range(2000):
+        now = 0.005 * number
+        servos: dict[int, list[Answer]] = {
+            **{0: [(0, WATCHDOG, LIMIT, own) for own in SENT[-1]], 1: [(0, MODE)] * 2},
+            2: [(0, 1, 0)] * 2,
+        }
+        if back.kind == 2:
+            times.append(now)
+        back.look(servos[back.kind], SENT, now)
+    assert bool(times) is watches_torque
+    if watches_torque:
+        between = [after - before for before, after in itertools.pairwise(times)]
+        assert times[0] < 0.05 and min(between) >= 0.05 and max(between) < 0.17
+        assert sum(between) / len(between) == pytest.approx(0.11, rel=0.1)
+
+
+def test_a_lost_read_back_is_repeated_once_in_5_ms_if_that_takes_less_than_half_of_a_short_cycle() -> None:
+    def may(interval: float, *times: float, takes: float = 0.001) -> list[bool]:
+        spans = (1, 2), GOALS, MODES, [(MODE,)] * 2, TORQUE, [(LIMIT,)] * 2
+        back = ReadBack(*spans, interval=interval, fast=False)
+        return [back.may_repeat(now, takes) for now in times]
+
+    assert may(0.004, 1.0, 1.0049, 1.0051, 1.0099) == [True, False, True, False]
+    assert may(0.004, 0.0, takes=0.0019) == [True] and may(0.004, 0.0, takes=0.0021) == [False]
+    assert may(0.005, 0.0) == [True] and may(0.0051, 0.0) == [False], (
+        "a delay of a long cycle leaves the arm unobserved"
+    )
+
+
+def test_a_read_back_is_overdue_75_ms_after_the_first_one_that_was_left_out() -> None:
+    back = read_back()
+    assert back.overdue_at == math.inf
+    back.postponed(1.0)
+    back.postponed(1.01)
+    assert back.overdue_at == pytest.approx(1.075)
+    back.delayed(1.08, 0.0, alone=True)
+    assert back.overdue_at == pytest.approx(1.075 + 0.075 / 2), "if only one of two was read, the other soon follows"
+    back.delayed(1.09, 0.0, alone=False)
+    assert back.overdue_at == pytest.approx(1.09 + 0.075)
+    back.delayed(1.0, 0.0, alone=True)
+    assert back.overdue_at == pytest.approx(1.0 + 0.075), "but never later than after the usual pause"
+
+
+@pytest.mark.parametrize("between", ["nothing", "silence", "collisions"])
+def test_only_read_backs_that_show_a_goal_count_when_three_of_six_are_missed(between: str) -> None:
+    """Between two missed goals there are two read-backs, which show nothing or the latest goals."""
+    back, now = read_back(), 1.0
+    look(back, now)
+    own: list[Answer] = [(0, WATCHDOG, LIMIT, goal) for goal in SENT[-1]]
+    late: Answer = (0, WATCHDOG, LIMIT, SENT[-2][1])
+    for _ in range(3):
+        for servos, collided in (
+            ([own[0], late], False),
+            *2 * [([own[0], None] if between == "silence" else own, between == "collisions")],
+        ):
+            now += 1e-4
+            assert not reads_modes(back)
+            back.look(servos, SENT, now, collided=collided)
+    assert (back.lost is not None) is (between != "nothing")
+
+
+@pytest.mark.parametrize(("limit", "goals"), [(LIMIT, (FOREIGN, FOREIGN)), (LIMIT - 1, (SENT[-1][0], OURS))])
+def test_a_program_that_writes_to_every_servo_is_found_as_well(limit: int, goals: tuple[int, int]) -> None:
+    back = read_back()
+    look(back, 1.0)
+    servos: list[Answer] = [(0, WATCHDOG, limit, goal) for goal in goals]
+    found = [back.look(servos, SENT, 1.0 + 1e-4 * number) for number in range(2)]
+    assert found[0] is None and found[1] is not None and found[1].place == 0
+
+
+@pytest.mark.parametrize(("goal", "goals"), [(OURS, 0), (LONG_AGO, 3)])
+def test_modes_that_are_due_are_read_between_sightings_that_are_far_from_proof(goal: int, goals: int) -> None:
+    """Four read-backs of goals come before them, including the one that raised the doubts; without doubts, one."""
+    back = read_back()
+    look(back, 0.0)
+    look(back, 1.0, goal=goal)
+    count = 0
+    while not reads_modes(back):
+        count += 1
+        look(back, 1.0 + 1e-3 * count)
+    assert count == goals

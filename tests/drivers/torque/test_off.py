@@ -160,6 +160,8 @@ def test_a_reason_that_concerns_several_servos_is_given_once() -> None:
     assert both in said and said.count("does not answer") == 1
     said = str(TorqueOff((), ((first, "It is hot."), (second, "It is silent."))))
     assert f"for {str(first).upper()}. It is hot. Nor for {str(second).upper()}. It is silent. The" in said
+    wet = by_reason([(joint, "It is hot. It is also wet.") for joint in JOINTS])
+    assert wet == {"Each is hot. It is also wet.": JOINTS}
     assert by_reason(reasons[1:]) == {"It does not answer. Check it.": [second]}
     assert by_reason([(first, f"{first.title}: Current Limit reads 3.")]) == {"Current Limit reads 3.": [first]}
     assert by_reason([(first, "It is hot."), (second, "It is silent.")]) == {

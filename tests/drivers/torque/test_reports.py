@@ -5,8 +5,9 @@ from collections.abc import Callable
 import pytest
 
 from hil.drivers.bus import BusConfig, ServoBus
-from hil.drivers.errors import NoReply, ServoFault, TorqueNotOff
-from hil.drivers.packet import HardwareError
+from hil.drivers.errors import DriverError, NoReply, ServoFault, ServoRefused, TorqueNotOff
+from hil.drivers.packet import HardwareError, StatusError
+from hil.drivers.servo import Servo
 from tests.support.bench import servos
 
 Make = Callable[..., BusConfig]
@@ -113,6 +114,87 @@ def test_a_servo_that_refuses_torque_because_of_a_fault_is_named_with_it(fake_co
         with pytest.raises(ServoFault, match=r"'elbow'.*overload.*stays off until it is rebooted"), bus.torque(0.1):
             pytest.fail("torque came on")
         assert not any(each.torque_enabled for each in servos(bus).values())
+
+
+@pytest.mark.parametrize(
+    ("errors", "said"),
+    [
+        ([HardwareError.INPUT_VOLTAGE] * 2, "hardware error: input voltage"),
+        ([HardwareError.OVERLOAD, HardwareError(0)], "raised its alert, but reports no hardware error now"),
+        ([HardwareError(0)], "refused writing 1 to Torque Enable"),
+    ],
+)
+def test_a_servo_that_refuses_torque_is_named_with_its_hardware_error_if_there_is_one(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch, errors: list[HardwareError], said: str
+) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        servo, shown = list(bus.drives.values())[1], iter(errors)
+        write = servo.write
+
+        def refusing(register: str, value: int) -> None:
+            if (register, value) == ("Torque Enable", 1):
+                raise ServoRefused(f"{servo.title} refused writing 1 to Torque Enable.", StatusError.ACCESS)
+            write(register, value)
+
+        monkeypatch.setattr(servo, "write", refusing)
+        monkeypatch.setattr(servo, "hardware_error", lambda: next(shown))
+        with pytest.raises(DriverError, match=said) as stop, bus.torque(0.1):
+            pytest.fail("torque came on")
+        assert isinstance(stop.value, ServoFault) is bool(errors[0]) and "'elbow'" in str(stop.value)
+
+
+def test_a_faulty_servo_whose_shutdown_setting_cannot_be_read_counts_as_without_torque(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        second = tuple(bus.drives)[1]
+        servos(bus)[2].memory.set("Hardware Error Status", int(HardwareError.INPUT_VOLTAGE))
+        read = bus.drives[second].read
+
+        def reading(register: str) -> int:
+            if register == "Shutdown":
+                raise NoReply("silent")
+            return read(register)
+
+        monkeypatch.setattr(bus.drives[second], "read", reading)
+        assert "Its torque stays off until it is rebooted" in bus._fault(second, its_own=True)
+
+
+@pytest.mark.parametrize(
+    ("answer", "rebooted", "disarmed"), [(True, {2}, set()), (False, set(), {2}), (None, *2 * [set()])]
+)
+def test_a_watched_servo_that_was_silent_when_torque_was_cut_is_asked_whether_it_was_rebooted(
+    fake_config: Make,
+    monkeypatch: pytest.MonkeyPatch,
+    answer: bool | None,
+    rebooted: set[int],
+    disarmed: set[int],
+) -> None:
+    asked: list[int] = []
+
+    def was_rebooted(servo: Servo) -> bool | None:
+        asked.append(servo.id)
+        return answer
+
+    monkeypatch.setattr("hil.drivers.torque.switch.was_rebooted", was_rebooted)
+    with ServoBus.open(fake_config()) as bus:
+        with bus.torque(watchdog=0.1):
+            bus.exchange([0.0, 0.0])
+        assert asked == [], "all have answered"
+        for is_watched in (True, False):
+            if not is_watched:
+                bus._without_watchdog.update(bus.drives)
+            asked.clear()
+            with bus.torque(watchdog=0.1):
+                servos(bus)[2].connected = False
+                bus.exchange([0.0, 0.0])
+                servos(bus)[2].connected = True
+            report = bus.torque_off_report
+            assert report is not None and report.is_off
+            assert asked == ([2] if is_watched else []), "without a watchdog there was none to disarm"
+            if is_watched:
+                assert {joint.id for joint in report.rebooted} == rebooted
+                assert {joint.id for joint in report.disarmed} == disarmed
 
 
 @pytest.mark.parametrize(

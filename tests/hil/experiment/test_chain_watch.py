@@ -72,6 +72,29 @@ def test_a_joint_that_comes_back_fast_may_bounce_off_that_stop(config: Config, a
     assert blocked[2:4] == [at < 0.1] * 2 and not blocked[-1]
 
 
+@pytest.mark.parametrize(
+    ("speeds", "may_be_stop"),
+    [
+        ((-0.3, -0.5, -0.7), [False, False, False]),  # an end stop does not speed a joint up
+        ((-0.8, -0.2, 0.39), [False, True, True]),
+        ((-0.8, -0.2, 0.41), [False, True, False]),  # nor does it return more than half of the speed
+        ((-0.2, -0.8, -0.3, 0.39), [False, False, True, True]),
+        ((-0.8, 0.39, 0.3), [False, True, True]),
+    ],
+)
+def test_an_end_stop_slows_a_joint_down_and_returns_at_most_half_of_its_speed(
+    config: Config, speeds: tuple[float, ...], may_be_stop: list[bool]
+) -> None:
+    watch, supports = ChainWatch(config, [1.0, 1.0, 1.0]), []
+    watch._observer = cast("Any", SimpleNamespace(observe=lambda *given: supports.append(given[-1]) or -1))
+    rest = np.array(config.arm.rest_pose)
+    look(config, watch, (rest[0] + 0.3, rest[1], rest[2] + 0.5), (0.0, 0.0, 0.0), -100, speeds[0])
+    supports.clear()
+    for number, speed in enumerate(speeds):
+        look(config, watch, (rest[0] + 0.3, rest[1], rest[2] + 0.02), (0.0, 0.0, 0.0), number, speed)
+    assert [support[2] == -1.0 for support in supports] == may_be_stop
+
+
 def test_but_it_is_if_a_torque_away_from_that_stop_does_not_move_it(config: Config) -> None:
     with pytest.raises(SafetyStop, match="is not moving, with "):
         stands(config, 0.02, 2.0)
@@ -252,6 +275,20 @@ def test_what_is_said_of_a_joint_at_rest_and_of_one_that_moves(config: Config, w
     assert hardware.startswith("something is blocking it") and "encoder is frozen" in hardware
     with pytest.raises(SafetyStop, match=r"does not move like any arm .*: \+0\.250 N m"):
         sees(config, watch, interval * (last + 1), velocity=(-0.06, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("away", "may_be"), [(0.07, True), (0.1, False), (-0.1, False)])
+def test_a_wrong_direction_presses_only_a_joint_against_its_stop_that_has_not_left_it(
+    config: Config, watch: ChainWatch, away: float, may_be: bool
+) -> None:
+    interval = 1 / config.experiment.rate
+    sees(config, watch, 0.0, away=(away, 0.0, 0.0))
+    for number in range(1, math.ceil(0.3 / interval) + 5):
+        sees(config, watch, interval * number, goal_current=(0.01 * number, 0.0, 0.0))
+    cast(Any, watch._observer).found = 0
+    with pytest.raises(SafetyStop, match="is not moving, with ") as stop:
+        sees(config, watch, interval * (number + 1))
+    assert ("end stop on which it rests" in str(stop.value)) is may_be
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.0])

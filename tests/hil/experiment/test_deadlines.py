@@ -210,6 +210,53 @@ def test_a_computer_is_busy_for_a_while_only(arm: Arm) -> None:
     assert not silence.is_busy
 
 
+def test_servos_that_were_never_heard_are_silent_from_the_first_exchange_on(arm: Arm) -> None:
+    silence, said = Silence(arm(), 1 / RATE, patience=3 / RATE), []
+    assert not silence.any_missed and not silence.others_answer and not silence.is_busy
+    for number in range(6):
+        silence.ask(10.0 + number / RATE)
+        said.append(silence.missed(0, 10.0 + number / RATE))
+    assert said[:-1] == [None] * 5 and said[-1] is not None and said[-1].startswith("15 ms ago; safety.missing_time")
+
+
+@pytest.mark.parametrize(
+    ("stall", "is_busy", "told"), [(0.02, True, True), (0.02, False, False), (0.0009, True, False)]
+)
+def test_while_an_arm_is_lowered_a_stall_is_blamed_on_the_computer_only_if_that_is_known_to_be_busy(
+    arm: Arm, stall: float, is_busy: bool, told: bool
+) -> None:
+    silence = Silence(arm(), 1 / RATE, heard_at=0.0)
+    if is_busy:
+        silence.woke_up(0.0, 0.003)
+    silence.ask(0.0)
+    silence.heard(0, 0.0)
+    said = None
+    for number in range(1, 40):
+        now = stall + number / RATE
+        silence.ask(now)
+        if (said := silence.missed(0, now)) is not None:
+            break
+    assert said is not None and "lowering the arm" in said
+    assert ("because this computer was busy" in said) is told
+
+
+@pytest.mark.parametrize(("stall", "told"), [(0.0009, False), (0.0011, True)])
+def test_a_stall_of_a_millisecond_is_told(arm: Arm, stall: float, told: bool) -> None:
+    said = asked(Silence(arm(), 1 / RATE), [stall + n / RATE for n in range(1, 7)])[-1]
+    assert said is not None and ("1 ms of it because this computer was busy" in said) is told
+
+
+@pytest.mark.parametrize("lowered", [False, True])
+def test_on_the_way_down_one_missing_reply_may_be_the_second(arm: Arm, lowered: bool) -> None:
+    """Replies may have been missing before."""
+    silence = Silence(arm(), 1 / RATE, heard_at=0.0 if lowered else None)
+    if not lowered:
+        silence.ask(0.0)
+        silence.heard(0, 0.0)
+    silence.ask(0.07)
+    assert (silence.missed(0, 0.07) is not None) is lowered
+
+
 def test_one_refusal_is_enough_after_the_time_allowed(arm: Arm) -> None:
     silence = Silence(arm(), 0.02)
     assert asked(silence, [0.02], refused=True)[-1] is not None

@@ -540,10 +540,11 @@ def memory(guard: Guard, check: str) -> Any:
     return guard._joints[0][check]
 
 
-def test_how_long_an_exchange_took_beyond_the_shortest_is_how_unsure_its_time_is(arm: Arm) -> None:
-    """A joint at 1 rad/s: its position is unsure by as many radians."""
+@pytest.mark.parametrize("error", [0, 3])
+def test_how_long_an_exchange_took_beyond_the_shortest_is_how_unsure_its_time_is(arm: Arm, error: int) -> None:
+    """A joint at 1 rad/s: its position is unsure by as many radians. An error of the other joint changes nothing."""
     guard = Guard(arm())
-    moving = STILL._replace(velocity=(1.0, 0.0))
+    moving = STILL._replace(velocity=(1.0, 0.0), error=(0, error), missing=(False, bool(error)))
     unsure = []
     for number, took in enumerate((0.001, 0.0015, 0.0008, 0.0009)):
         now = number / 400

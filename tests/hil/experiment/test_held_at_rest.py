@@ -10,12 +10,14 @@ from hypothesis import strategies as st
 
 from hil.config.schema import load_config
 from hil.errors import Cause, SafetyStop
+from hil.experiment.guard import Guard
 from hil.experiment.held_at_rest import AWAY_RAD, OVERSHOOT, HeldAtRest
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress
 from hil.plan.plan import make_plan
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
+from tests.support.motion import STILL
 
 UPRIGHT = load_config("fake_inverted")
 POSE = np.array(UPRIGHT.arm.rest_pose)
@@ -33,6 +35,21 @@ def test_a_joint_may_swing_as_far_as_the_arm_was_away_and_a_little_more(
         away[joint] -= 1.001 * allowed
         found = held.look(away)
         assert found is not None and found[0] == joint and f"{-1.001 * allowed:+.3f} rad" in found[1]
+
+
+@pytest.mark.parametrize(("known", "stops"), [(True, False), (False, True)])
+def test_how_far_the_arm_was_away_before_torque_was_on_counts(known: bool, stops: bool) -> None:
+    """If that is not known, the first sample counts: the stabiliser may have moved the arm by then."""
+    guard, pose = Guard(UPRIGHT), tuple(POSE)
+    if known:
+        guard.rests_at((pose[0] + 0.4, pose[1]))
+    guard.look_while_held(STILL._replace(position=pose))
+    away = STILL._replace(position=(pose[0] + 0.3, pose[1]))
+    if stops:
+        with pytest.raises(SafetyStop, match="rad from its rest pose"):
+            guard.look_while_held(away)
+    else:
+        guard.look_while_held(away)
 
 
 @pytest.mark.parametrize("velocity", [0.3, 3.0])

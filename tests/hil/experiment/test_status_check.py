@@ -1,6 +1,7 @@
 """Status registers of the servos: every fault is detected, and normal values are accepted."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import pytest
 
@@ -8,6 +9,7 @@ from hil.config.schema import Config, load_config
 from hil.drivers.state import Status
 from hil.errors import Cause
 from hil.experiment.status_check import StatusCheck
+from tests.support.edits import with_second_servo
 from tests.support.paths import CONFIGS
 
 Arm = Callable[..., Config]
@@ -36,6 +38,8 @@ def test_why_a_watchdog_tripped_depends_on_how_long_nothing_was_sent(arm: Arm, g
     check.longest_gap = gap
     wrong = check.look(1, FINE._replace(watchdog=255), 0.1, 1.0)
     assert wrong is not None and said in wrong[1] and ("another program" in wrong[1]) == (gap < 0.05)
+    unknown = StatusCheck(arm()).look(1, FINE._replace(watchdog=255), 0.1, 1.0)
+    assert unknown is not None and "another program" in unknown[1]
 
 
 def test_what_a_short_status_leaves_out_is_not_wrong(arm: Arm) -> None:
@@ -77,7 +81,7 @@ def test_a_servo_that_holds_the_goal_it_seemed_to_have_missed_answers_a_cycle_la
     assert wrong is not None and wrong[0] is cause and ("a cycle late" in wrong[1]) == (cause is Cause.STALE)
 
 
-@pytest.mark.parametrize(("held", "late"), [((0.03, 0.04), 4), ((0.03, 0.03), 0)])
+@pytest.mark.parametrize(("held", "late"), [((0.03, 0.04), 4), ((0.03, 0.03), 0), ((0.04, 0.03), 0)])
 def test_a_goal_held_later_than_it_was_sent_shows_how_late_replies_are(
     arm: Arm, held: Sequence[float], late: int
 ) -> None:
@@ -308,3 +312,55 @@ def test_a_clock_that_is_right_tells_late_goals_from_late_replies(arm: Arm, late
 def test_while_an_arm_is_lowered_only_a_tripped_watchdog_stops(arm: Arm, ticks: int, stops: bool) -> None:
     wrong = StatusCheck(arm(), bears_errors=True).look_at_watchdog(ticks)
     assert (wrong is not None) is stops
+
+
+@pytest.mark.parametrize(("apart", "cause"), [(0.0025, Cause.GOALS_LOST), (0.0035, Cause.STALE)])
+def test_a_clock_that_stands_still_for_more_than_3_ms_shows_an_old_reply(arm: Arm, apart: float, cause: Cause) -> None:
+    """It counts milliseconds."""
+    check = StatusCheck(arm())
+    wrong = [check.look(0, FINE._replace(goal=0.05), 0.1, 1.0 + apart * number) for number in range(2)][-1]
+    assert wrong is not None and wrong[0] is cause
+
+
+def foreign(check: StatusCheck, goals: Sequence[float], agrees_at: int, held: float) -> bool:
+    """Whether a servo that holds `held` after `goals` were sent, the one at index `agrees_at` being the last that it
+    is known to have held, counts as commanded by another program.
+    """
+    for number, goal in enumerate(goals):
+        check.sent((goal, 0.0))
+        if number == agrees_at:
+            assert check.look(0, FINE._replace(goal=goal), goal, 1.0) is None
+    wrong = None
+    for number in range(2):
+        check.sent((goals[-1], 0.0))
+        now = 1.01 + 0.01 * number
+        wrong = check.look(0, FINE._replace(goal=held, tick=now), goals[-1], now)
+    assert wrong is not None and wrong[0] is Cause.GOALS_LOST
+    return "this program never sent" in wrong[1]
+
+
+@pytest.mark.parametrize(("earlier", "is_foreign"), [(3, False), (5, True)])
+def test_a_servo_that_misses_goals_may_hold_one_from_shortly_before_it_was_last_right(
+    arm: Arm, earlier: int, is_foreign: bool
+) -> None:
+    goals = [0.01 * number for number in range(20)]
+    assert foreign(StatusCheck(arm()), goals, 10, 0.01 * (11 - earlier)) is is_foreign
+
+
+@pytest.mark.parametrize(("before", "since", "is_foreign"), [(0, 245, True), (200, 245, True), (0, 255, False)])
+def test_what_was_sent_is_known_for_256_goals(arm: Arm, before: int, since: int, is_foreign: bool) -> None:
+    assert foreign(StatusCheck(arm()), [0.1] * (before + since), before, 0.3) is is_foreign
+
+
+def test_a_servo_that_was_never_right_may_still_miss_goals_of_this_program(arm: Arm) -> None:
+    assert not foreign(StatusCheck(arm()), [0.05, 0.05, 0.1], -1, 0.05)
+    assert foreign(StatusCheck(arm()), [0.05, 0.05, 0.1], -1, 0.3)
+
+
+def test_of_the_sum_of_two_servos_goals_nothing_is_known(tmp_path: Path) -> None:
+    """The halves that they hold may differ in age."""
+    path = tmp_path / "arm.toml"
+    path.write_text(
+        with_second_servo((CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")), encoding="utf-8"
+    )
+    assert not foreign(StatusCheck(load_config(path)), [0.05, 0.05, 0.1], 2, 0.3)

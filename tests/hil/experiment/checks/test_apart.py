@@ -5,11 +5,14 @@ from pathlib import Path
 import pytest
 
 import hil
+from hil.config.schema import load_config
 from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import Mode, servo_model
 from hil.errors import Cause, SafetyStop
 from hil.experiment.checks.apart import ALLOWED_RAD, Apart, causes_of_standstill
+from hil.experiment.guard import Guard
 from tests.support.edits import QUICK, replaced, with_second_servo
+from tests.support.motion import STILL, at
 from tests.support.paths import CONFIGS
 
 
@@ -33,6 +36,15 @@ def paired(arm: Path, fault: str = "") -> Path:
     short = ("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"), *QUICK
     arm.write_text(f"{with_second_servo(replaced(text, *short))}\n{fault}", encoding="utf-8")
     return arm
+
+
+def test_the_guard_stops_at_the_sample_in_which_two_servos_are_apart(tmp_path: Path) -> None:
+    guard = Guard(load_config(paired(tmp_path / "arm.toml")))
+    for number, apart in enumerate((0.3, 0.3 + 0.9 * ALLOWED_RAD)):
+        guard.look(at(number, STILL._replace(apart=((apart,), ()))))
+    with pytest.raises(SafetyStop, match=r"'shoulder'.* ID 3 has turned \+0\.\d+ rad relative to the first") as stopped:
+        guard.look(at(2, STILL._replace(apart=((0.3 + 1.1 * ALLOWED_RAD,), ()))))
+    assert stopped.value.cause is Cause.APART
 
 
 def test_two_servos_that_turn_together_are_not_stopped(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -145,3 +146,34 @@ def test_a_false_velocity_is_compared_with_the_latest_motion(
         for number in range(4):
             state = STILL._replace(velocity=(min(moves, 14.9), 0.0), position=(-1.57 + moves * number / 400, 0.0))
             guard.look(at(number, state if number < 3 else state._replace(velocity=(velocity, 0.0))))
+
+
+@pytest.mark.parametrize(("driven_by", "stops"), [("voltage", True), ("current", False)])
+def test_a_servo_that_senses_its_supply_current_is_compared_with_its_goal_only_in_volts(
+    tmp_path: Path, driven_by: str, stops: bool
+) -> None:
+    text = (CONFIGS / "xl330_two_link.toml").read_text(encoding="utf-8")
+    if driven_by == "voltage":
+        for old, new in (
+            ("torque_constant = 0.354 ", 'mode = "pwm"\ntorque_per_volt = 0.1 '),
+            ("torque_constant_std = 0.035 ", "torque_per_volt_std = 0.01 "),
+            ("current_limit = 0.44 ", "voltage_limit = 3.0 "),
+        ):
+            assert text.count(old) == 2
+            text = text.replace(old, new)
+    path = tmp_path / "arm.toml"
+    path.write_text(text, encoding="utf-8")
+    config = load_config(path)
+    guard, goal = Guard(config), 0.9 * config.joints[1].goal_limit
+    without = STILL._replace(goal_current=(0.0, goal))
+
+    def look() -> None:
+        for number in range(60):
+            guard.look(at(number, without))
+
+    if not stops:
+        look()
+        return
+    with pytest.raises(SafetyStop) as stop:
+        look()
+    assert stop.value.cause is Cause.NOT_FOLLOWING
