@@ -84,9 +84,7 @@ class Silence:
         """Record an exchange begun at `now` [s]; all joints replied to it and to the previous one."""
         self._asked_at = self._all_heard_at = now
 
-    def missed(
-        self, joint: int, now: float, *, answered: bool = False, refused: bool = False, alone: bool = True
-    ) -> str | None:
+    def missed(self, joint: int, now: float, *, answered: bool, refused: bool, alone: bool) -> str | None:
         """Record a missing reply to an exchange; return a description of a silence that is too long, or None.
 
         now: when that exchange began, or when waiting for its replies ended [s].

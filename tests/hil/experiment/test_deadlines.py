@@ -140,6 +140,10 @@ def test_missing_too_long(count: int, seconds: float, too_long: bool) -> None:
     assert is_missing_too_long(count, seconds, Limit(0.015, "")) is too_long
 
 
+AN_ORDINARY_ONE = {"answered": False, "refused": False, "alone": True}
+"""A servo that does not answer although others do."""
+
+
 def asked(
     silence: Silence, times: Sequence[float], *, refused: bool = False, answered: bool = False, alone: bool = True
 ) -> list[str | None]:
@@ -197,7 +201,7 @@ def test_a_silence_begins_with_the_latest_exchange_that_all_answered(arm: Arm) -
     said = []
     for now in [0.1 + n / RATE for n in range(1, 7)]:
         silence.ask(now)
-        said.append(silence.missed(0, now))
+        said.append(silence.missed(0, now, **AN_ORDINARY_ONE))
     assert said == [None] * 5 + ["15 ms ago; safety.missing_time = 0.015 s allows 15 ms"]
 
 
@@ -215,7 +219,7 @@ def test_servos_that_were_never_heard_are_silent_from_the_first_exchange_on(arm:
     assert not silence.any_missed and not silence.others_answer and not silence.is_busy
     for number in range(6):
         silence.ask(10.0 + number / RATE)
-        said.append(silence.missed(0, 10.0 + number / RATE))
+        said.append(silence.missed(0, 10.0 + number / RATE, **AN_ORDINARY_ONE))
     assert said[:-1] == [None] * 5 and said[-1] is not None and said[-1].startswith("15 ms ago; safety.missing_time")
 
 
@@ -234,7 +238,7 @@ def test_while_an_arm_is_lowered_a_stall_is_blamed_on_the_computer_only_if_that_
     for number in range(1, 40):
         now = stall + number / RATE
         silence.ask(now)
-        if (said := silence.missed(0, now)) is not None:
+        if (said := silence.missed(0, now, **AN_ORDINARY_ONE)) is not None:
             break
     assert said is not None and "lowering the arm" in said
     assert ("because this computer was busy" in said) is told
@@ -254,7 +258,20 @@ def test_on_the_way_down_one_missing_reply_may_be_the_second(arm: Arm, lowered: 
         silence.ask(0.0)
         silence.heard(0, 0.0)
     silence.ask(0.07)
-    assert (silence.missed(0, 0.07) is not None) is lowered
+    assert (silence.missed(0, 0.07, **AN_ORDINARY_ONE) is not None) is lowered
+
+
+def test_the_time_spent_waiting_for_a_reply_counts_as_silence(arm: Arm) -> None:
+    """Even if it ends between two exchanges."""
+    silence = Silence(arm(), 0.005, patience=0.02, heard_at=0.0)
+    silence.ask(0.01)
+    assert silence.missed(0, 0.027, **AN_ORDINARY_ONE) is None
+    silence = Silence(arm(), 0.005, patience=0.02, heard_at=0.0)
+    silence.ask(0.01)
+    assert (
+        silence.missed(0, 0.029, **AN_ORDINARY_ONE)
+        == "29 ms ago; lowering the arm while other servos answer allows 28 ms"
+    )
 
 
 def test_one_refusal_is_enough_after_the_time_allowed(arm: Arm) -> None:
