@@ -119,7 +119,7 @@ class TorqueSwitch:
         if not 1 <= ticks <= 127:
             raise ValueError(f"watchdog must be 0.02 to 2.54 s, not {watchdog}")
         self._watchdog = watchdog
-        self.port.growth = 1
+        self.port.late_replies, self.port.growth = 0, 1  # late replies during set-up explain nothing later
         for joint, servo in self._servos.items():
             watched = joint not in self._without_watchdog
             if watched:

@@ -52,6 +52,14 @@ def test_goal_current_is_zero_and_the_watchdog_armed_before_torque_comes_on(
         assert not servos(bus)[servo_id].torque_enabled
 
 
+def test_late_replies_before_torque_came_on_are_forgotten(fake_config: Make) -> None:
+    """After a stop, late replies explain missing ones."""
+    with ServoBus.open(fake_config()) as bus:
+        bus.port.late_replies = 3
+        with bus.torque(watchdog=0.1):
+            assert bus.port.late_replies == 0
+
+
 def refusing(bus: ServoBus, servo_id: int, refused: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     """A servo that answers a write without an error but ignores it."""
     servo = servos(bus)[servo_id]
