@@ -67,6 +67,10 @@ TESTS = {
     "hil/experiment/stop_request.py": [f"{_EXPERIMENT}/test_stop_request.py"],
     "hil/plan/silence.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/plan/brake.py": ["tests/hil/plan/test_brake.py"],
+    "hil/drivers/preparation/cadence.py": ["tests/drivers/preparation/test_cadence.py"],
+    "hil/experiment/stopping/pace.py": [f"{_EXPERIMENT}/stopping/test_{name}.py" for name in ("pace", "way_down")],
+    "hil/experiment/stopping/way_down.py": [f"{_EXPERIMENT}/stopping/test_way_down.py"],
+    "hil/experiment/stopping/position_steps.py": [f"{_EXPERIMENT}/stopping/test_position_steps.py"],
     "hil/plan/recent_motion.py": ["tests/hil/plan/test_recent_motion.py", "tests/hil/plan/test_brake.py"],
     "hil/experiment/pace.py": [f"{_EXPERIMENT}/stream/test_stream_schedule.py"],
     "hil/experiment/stream.py": [
@@ -125,10 +129,6 @@ EQUIVALENT = {
     ("_OF_OTHERS * others else -1.0", "1.0  ->  2.0"): "work: any negative number",
     ("count & (count - 1) == 0", "1  ->  2"): "current_noise: the same for every count from 2 on",
     ("@dataclass(frozen=True)", "True  ->  False"): "nothing tries to change it",
-    (
-        "int(sample / CHECK_S + 1e-6)",
-        "1e-06  ->  2e-06",
-    ): "brake: more than rounding errors, and less than anything else",
     (
         "_add(self._former, self._sums",
         "0  ->  1",
