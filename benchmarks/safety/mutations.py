@@ -148,6 +148,10 @@ EQUIVALENT = {
         "velocity * towards  ->  velocity / towards",
     ): "chain_watch: it is 1, -1 or, for joints that no end stop can block, 0",
     (
+        "approach, before = velocity * towards",
+        "self._velocity * towards  ->  self._velocity / towards",
+    ): "chain_watch: as above",
+    (
         "may_lie = ",
         "torque * self._falls_to  ->  torque / self._falls_to",
     ): "chain_watch: it is 1, -1 or 0",

@@ -306,3 +306,13 @@ def test_once_the_arm_has_moved_as_described_the_description_is_doubted_last(
     hardware, described = str(stop.value).split(" If none of this applies: ")
     assert "the arm may not be the one described" in described and "described" not in hardware.split("moving: ")[-1]
     assert re.search("something is (blocking it|pushing or holding it)", hardware, re.IGNORECASE)
+
+
+def test_a_joint_bounces_off_its_stop_for_a_moment_only(config: Config, watch: ChainWatch) -> None:
+    """It has come from below; the recoil of the impact at 0.02 s is over after 50 ms, even if it gets faster."""
+    sees(config, watch, 0.0, away=(-0.1, 0.0, 0.3))
+    bounces = []
+    for at, velocity in ((0.01, 1.0), (0.02, -0.4), (0.05, -0.41), (0.08, -0.42)):
+        seen = sees(config, watch, at, away=(-0.05, 0.0, 0.3), velocity=(velocity, 0.0, 0.0))
+        bounces.append(seen.support[0])
+    assert bounces == [0.0, 1.0, 1.0, 0.0]
