@@ -23,6 +23,7 @@ from hil.drivers.torque.off import (
     disarm_watchdogs,
     is_torque_on,
     signals_held_back,
+    tell_watchdogs,
 )
 from hil.fakes.bus.clock import VirtualClock
 
@@ -256,3 +257,13 @@ def test_no_other_program_is_accused_by_an_answer_to_another_question(answers: l
 def test_a_servo_that_falls_silent_before_torque_is_on_is_named() -> None:
     with pytest.raises(NoReply):
         switched_on({JOINTS[0]: Misunderstood([1, 1])})  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize(("seconds", "value"), [(0.06, 3), (0.1, 5), (0.001, 1)])
+def test_watchdogs_are_set_in_units_of_20_ms_in_one_packet(seconds: float, value: int) -> None:
+    """Never to 0, which would switch them off."""
+    sent: list[bytes] = []
+    port: Any = SimpleNamespace(write=sent.append)
+    tell_watchdogs(port, {JOINTS[0]: Bench().servos[JOINTS[0]]}, seconds)
+    tell_watchdogs(port, {}, seconds)
+    assert sent == [encode(BROADCAST_ID, Instruction.SYNC_WRITE, bytes((98, 0, 1, 0, FIRST, value)))]

@@ -60,6 +60,16 @@ def test_late_replies_before_torque_came_on_are_forgotten(fake_config: Make) -> 
             assert bus.port.late_replies == 0
 
 
+def test_a_servo_that_answers_pings_only_is_made_to_answer_and_confirmed_off(fake_config: Make) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        with bus.torque(watchdog=0.1):
+            servos(bus)[2].write(68, b"\0")
+        report = bus.torque_off_report
+        assert report is not None and not report.unconfirmed
+        assert servos(bus)[2].value("Status Return Level") == 2
+        assert list(bus.drives.values())[1].answered_pings_only
+
+
 def refusing(bus: ServoBus, servo_id: int, refused: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     """A servo that answers a write without an error but ignores it."""
     servo = servos(bus)[servo_id]
