@@ -3,6 +3,7 @@
 import pytest
 
 from hil.experiment.stopping.pace import LAST_S, LONGER_S, LONGEST_S, Pace
+from hil.plan.silence import BRIDGED_S
 
 
 @pytest.mark.parametrize("late", [0.001, 0.004, 0.009, 0.016])
@@ -14,7 +15,10 @@ def test_exchanges_are_as_far_apart_as_the_replies_are_late(late: float, rate: i
         are_late = late > awaited
         pace.took(min(late, awaited), missed=are_late)
     assert pace.patience(0.0, are_late=False) > late
-    assert late <= pace.every / rate < late + 0.002 + 1 / rate or pace.every == 1
+    if late <= 1 / rate:
+        assert pace.every == 1, "every sample can be exchanged"
+    else:
+        assert late + 0.002 <= pace.every / rate + 1e-9 < late + 0.002 + 1 / rate
 
 
 def test_late_replies_are_awaited_longer_but_not_for_ever() -> None:
@@ -34,6 +38,27 @@ def test_lost_replies_are_asked_for_again_soon_unless_no_time_is_left(rate: int)
         awaited = 0.003 + (LONGER_S if is_last else 0.0)
         assert pace.patience(unheard, are_late=False) == pytest.approx(awaited), unheard
         assert pace.patience(unheard, are_late=False, are_damaged=True) == pytest.approx(0.003), "lost, not late"
+
+
+@pytest.mark.parametrize("unheard", [0.03, 0.054, BRIDGED_S])
+def test_late_replies_are_not_awaited_until_it_is_too_late_to_switch_torque_off(unheard: float) -> None:
+    """Torque must be off 100 ms after the latest reply, and switching it off may take 25 ms."""
+    ends = unheard + Pace(0.01, 0.005).patience(unheard, are_late=True)
+    assert ends <= 0.1 - 0.025 + 1e-9
+    assert ends == pytest.approx(min(unheard + LONGEST_S, 0.075)), "but as long as possible"
+
+
+def test_exchanges_become_rarer_only_if_replies_are_late_again() -> None:
+    pace = Pace(0.0025, 0.003)
+    pace.took(0.004, missed=False)
+    assert pace.every == 1, "a busy computer may be the reason"
+    pace.took(0.0024, missed=False)
+    pace.took(0.004, missed=False)
+    assert pace.every == 3, "6 ms from one exchange to the next, in whole samples"
+    pace.took(0.0074, missed=False)
+    assert pace.every == 3, "in time"
+    pace.took(0.009, missed=False)
+    assert pace.every == 5
 
 
 def test_replies_that_have_taken_longer_are_awaited_as_long() -> None:
