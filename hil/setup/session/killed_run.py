@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from hil.drivers.errors import NoReply, TorqueHeld
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import attainable, put_back, read_settings
+from hil.drivers.preparation.settings import LIMIT_OF_GOAL, attainable, put_back, read_settings
 from hil.drivers.servo import Servo
 from hil.setup.session import settings_file
 from hil.setup.session.settings_file import Kept
@@ -198,7 +198,15 @@ def recover(servo: Servo, port: str) -> Restored:
     was_on = switch_off_left(servo, kept)
     left = what_is_left(kept, servo, read_settings(servo))
     written = put_back(servo, left.wanted)
-    if not left.changed:
+    others = [left.others] if left.changed else []
+    for name, value in attainable(servo, left.wanted).items():
+        if value != (wanted := left.wanted[name]):
+            others.append(
+                f"its {name} is {value} and was {wanted} before the run of {kept.since}, because its "
+                f"{LIMIT_OF_GOAL[name]} does not allow more. Another program changed this limit; once it has been set "
+                "back with DYNAMIXEL Wizard 2.0, the next hil check restores the goal."
+            )
+    if not others:
         settings_file.forget(kept)
     told = [f"{name} {before} -> {after}" for name, (before, after) in written.items()]
-    return Restored(told, left.others if left.changed else "", was_on)
+    return Restored(told, " ".join(others), was_on)

@@ -42,7 +42,10 @@ def test_settings_that_a_killed_program_left_are_restored_up_to_a_limit_lowered_
     bench.servos[2].write(36, (300).to_bytes(2, "little"))
     kept.write_text(left, encoding="utf-8")
     list(check_arm(config))
-    assert not kept.exists() and bench.servos[2].value("Goal PWM") == 300
+    assert kept.exists() and bench.servos[2].value("Goal PWM") == 300, "the rest once the limit allows it"
+    bench.servos[2].write(36, (885).to_bytes(2, "little"))
+    list(check_arm(config))
+    assert not kept.exists() and bench.servos[2].value("Goal PWM") == 885
 
 
 def test_settings_are_found_by_their_adapter_whatever_its_port_is_called_now(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -183,6 +183,19 @@ def test_a_pwm_limit_that_another_program_lowered_is_named_and_goals_are_restore
     assert bench.servos[2].value("Goal PWM") == (885 if is_undone else limit)
 
 
+def test_a_check_keeps_a_goal_until_its_limit_allows_it(arm: Arm, bench: Bench, state_folder: Path) -> None:
+    """The message after the run names `hil check` as the next command, before the limit has been set back."""
+    with pytest.raises(ExperimentError, match="PWM Limit was changed"), servo_session(arm(SHORT)):
+        bench.servos[2].write(36, (400).to_bytes(2, "little"))
+    for _ in range(2):
+        found = [each for each in check_arm(arm(SHORT)) if each.what == "settings from an earlier run"]
+        assert ["Goal PWM is 400 and was 885" in str(each) for each in found] == [True]
+        assert len(list(state_folder.glob("*.json"))) == 1
+    bench.servos[2].write(36, (885).to_bytes(2, "little"))
+    list(check_arm(arm(SHORT)))
+    assert bench.servos[2].value("Goal PWM") == 885 and list(state_folder.glob("*.json")) == []
+
+
 @pytest.mark.parametrize(
     ("address", "goal", "limit", "before"),
     [(36, "Goal PWM", "PWM Limit", 885), (38, "Goal Current", "Current Limit", 1193)],
