@@ -122,6 +122,8 @@ class Exchange:
         every += _of_other_lengths(every, beside, len(self.ids))
         reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
         self.heard = Heard(self.ids, reads)
+        self.quickest = max(self._timeout(read, return_delay) for read in reads)
+        """Time within which all replies arrive if this computer is not busy [s]."""
         least = max(patience, min(PATIENCE_SHARE * interval, MOST_PATIENCE_S))
         self._wire_s = {read: port.wire_time(self._bytes(read)) for read in reads}
         self._plans = [

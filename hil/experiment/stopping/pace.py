@@ -4,7 +4,7 @@ Servos hold their latest goal. If replies come too late for one exchange per sam
 is exchanged from then on, until the end.
 """
 
-from math import ceil
+from math import ceil, inf
 
 from hil.plan.silence import BRIDGED_ALONE_S
 
@@ -26,12 +26,14 @@ MARGIN_S = 0.002
 class Pace:
     """Adapts the interval between exchanges and the reply timeout to late replies.
 
-    interval: time between two samples [s]. patience: reply timeout during the experiment [s].
+    interval: time between two samples [s]. patience: reply timeout during the experiment [s]. quickest: time within
+    which replies arrive if this computer is not busy [s].
     """
 
-    def __init__(self, interval: float, patience: float) -> None:
+    def __init__(self, interval: float, patience: float, quickest: float = inf) -> None:
         self._interval = interval
         self._least = patience
+        self._quickest = min(patience, quickest)
         self._longest = 0.0
         self._first = self._usual = max(patience, min(patience + LONGER_S, LONGEST_S))
         self._was_late = False
@@ -46,8 +48,8 @@ class Pace:
         """
         if not are_late and not self._was_late:
             # Lost replies are asked for again soon; the last exchange before the limit waits for late ones.
-            is_last = not are_damaged and unheard + self._least > BRIDGED_ALONE_S
-            return self._usual if is_last else min(max(self._least, self._longest + MARGIN_S), self._usual)
+            is_last = not are_damaged and unheard + self._quickest > BRIDGED_ALONE_S
+            return self._usual if is_last else min(max(self._quickest, self._longest + MARGIN_S), self._usual)
         return max(min(max(self._least, LONGEST_S), LAST_S - unheard), LONGER_S)
 
     def took(self, seconds: float, *, missed: bool) -> None:

@@ -137,8 +137,11 @@ class WayDown:
         has changed.
         """
         since = self._clock.now() - whole.time_before_write
-        if since <= BRIDGED_ALONE_S or since > BRIDGED_S:
-            return since > BRIDGED_S
+        asked = latest.time_before_write - whole.time_before_write
+        if since > BRIDGED_S:
+            return True
+        if since <= BRIDGED_ALONE_S or (asked <= BRIDGED_ALONE_S and since <= BRIDGED_ALONE_S + LONGER_S):
+            return False
         return not all(latest.missing) or (len(latest.missing) > 1 and self._bus.first_hides_others(LONGER_S))
 
     def _follow(self, state: State, stopped: Stopped) -> State:
@@ -150,7 +153,7 @@ class WayDown:
         self._is_shared = self._bus.prepared.heard.strangers >= 1.0
         self._bus.bear_others()
         self._bus.prepared.accept_any_order()
-        self._pace = Pace(self._interval, self._bus.prepared.patience)
+        self._pace = Pace(self._interval, self._bus.prepared.patience, self._bus.prepared.quickest)
         self._sent_at, self._heard_at, self._goal = self._clock.now(), state.time_before_write, stopped.goal
         # The path begins with the latest state that is known, which may be a few exchanges old.
         old = self._clock.now() - state.time_before_write if stopped.is_blind else 0.0

@@ -25,6 +25,7 @@ class Bus:
         self.clock = VirtualClock()
         self.exchanges_per_sample = turns
         self.patience = 0.02
+        self.quickest = math.inf
         self.read_back_at = math.inf
         self.awaited_until = -math.inf
         self.heard_instead = self.commanded_by_another = ""

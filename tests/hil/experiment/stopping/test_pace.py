@@ -61,6 +61,18 @@ def test_exchanges_become_rarer_only_if_replies_are_late_again() -> None:
     assert pace.every == 5
 
 
+@pytest.mark.parametrize(("quickest", "awaited"), [(0.004, 0.004), (0.02, 0.009)])
+def test_at_low_rates_lost_replies_are_awaited_only_as_long_as_they_usually_take(
+    quickest: float, awaited: float
+) -> None:
+    """Not for the larger part of a sample, as during the experiment."""
+    pace = Pace(0.0125, 0.009, quickest)
+    assert pace.patience(0.018, are_late=False) == pytest.approx(awaited)
+    assert pace.patience(0.0235, are_late=False) == pytest.approx(awaited if quickest < 0.0045 else 0.009 + LONGER_S)
+    pace.took(0.0035, missed=False)
+    assert pace.patience(0.018, are_late=False) == pytest.approx(max(awaited, 0.0055))
+
+
 def test_replies_that_have_taken_longer_are_awaited_as_long() -> None:
     pace = Pace(0.02, 0.003)
     pace.took(0.006, missed=False)

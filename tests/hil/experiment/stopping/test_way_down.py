@@ -149,25 +149,30 @@ def test_an_arm_whose_watchdogs_have_acted_cannot_be_lowered(
 
 
 @pytest.mark.parametrize(
-    ("silent", "missing", "hides", "is_lowered"),
+    ("asked", "silent", "missing", "hides", "is_lowered"),
     [
-        (0.02, (False, True), False, True),
-        (0.03, (False, True), False, False),
-        (0.05, (True, True), False, True),
-        (0.05, (True, True), True, False),
-        (0.07, (True, True), False, False),
+        (0.018, 0.02, (False, True), False, True),
+        (0.027, 0.035, (False, True), False, True),
+        (0.029, 0.035, (False, True), False, False),
+        (0.027, 0.037, (False, True), False, False),
+        (0.045, 0.05, (True, True), False, True),
+        (0.045, 0.05, (True, True), True, False),
+        (0.045, 0.07, (True, True), False, False),
     ],
 )
 def test_an_arm_is_lowered_without_replies_only_from_where_it_was_just_seen(
-    make: Make, silent: float, missing: tuple[bool, bool], hides: bool, is_lowered: bool
+    make: Make, asked: float, silent: float, missing: tuple[bool, bool], hides: bool, is_lowered: bool
 ) -> None:
-    """One servo alone is bridged for less time than all: it may only hear another ID, and be fed by all packets."""
+    """One servo alone is bridged for less time than all: it may only hear another ID, and be fed by all packets. So the
+    last packet counts, and its replies may be awaited.
+    """
     made = make()
     made.bus.first_hides = hides
     state = made.stopped.whole
     assert state is not None
     made.bus.clock.wait_until(state.time_before_write + silent)
-    (told,) = made.lower(latest=state._replace(missing=missing))
+    latest = state._replace(missing=missing, time_before_write=state.time_before_write + asked)
+    (told,) = made.lower(latest=latest)
     assert ("was lowered" in told) is is_lowered and ("it fell: replies had been missing" in told) is not is_lowered
     assert is_lowered or not made.bus.times("sample")
 
