@@ -37,6 +37,8 @@ class Bus:
         self.takes = takes
         self.unanswered: list[int] = []
         """Numbers of the exchanges to which the second servo does not reply, counted from the first."""
+        self.silent: list[int] = []
+        """Numbers of the exchanges to which no servo replies."""
         self.exchanges = 0
         self.calls: list[Call] = []
         self.velocity = NOTHING
@@ -71,7 +73,8 @@ class Bus:
         now = self.clock.now()
         self.calls.append(("between" if between else "sample", round(now, 6), *goals))
         self.clock.wait_until(now + (self.takes.pop(0) if len(self.takes) > 1 else self.takes[0]))
-        missing = (False, self.exchanges in self.unanswered)
+        is_silent = self.exchanges in self.silent
+        missing = (is_silent, is_silent or self.exchanges in self.unanswered)
         self.exchanges += 1
         position = tuple(math.nan if each else HELD + self.wobble * (len(self.calls) % 2) for each in missing)
         after, sent = self.clock.now(), tuple(goals)

@@ -30,9 +30,22 @@ class Lowers(Checks):
 
     every = 1
     needs_another_path = False
+    pushed_at = -1
+    """Number of the look after which another path is needed; -1 for never."""
 
     def slow_down(self, every: int) -> None:
         self.every = every
+        self.calls.append(("slow", every))
+
+    def others_answer(self) -> None:
+        self.calls.append(("others answer",))
+
+    def begin_again(self, _state: State, _goal: list[float]) -> int:
+        self.needs_another_path = False
+        return 2
+
+    def check_time(self, seconds: float) -> None:
+        self.calls.append(("time", round(seconds, 6)))
 
     def lies(self, _state: State) -> bool:
         return self.lies_already
@@ -45,6 +58,8 @@ class Lowers(Checks):
 
     def look(self, index: int, _state: State, gap: float, *, between: bool = False) -> None:  # type: ignore[override]
         self.calls.append(("look", index, round(gap, 6), between))
+        if len(self.of("look")) == self.pushed_at:
+            self.needs_another_path = True
 
     def lies_elsewhere(self, state: State) -> str:
         return self.elsewhere if all(map(math.isfinite, state.position)) else "at nan"
@@ -221,7 +236,8 @@ def test_late_replies_slow_the_way_down(make: Make) -> None:
     made.lowering.samples = 12
     assert made.lower() == ["The arm was lowered to its rest pose."]
     assert made.bus.times("sample") == pytest.approx([0.051, 0.111, 0.201, 0.301, 0.401, 0.501, 0.601])
-    assert made.lowering.every == 2 and [each[0] for each in made.lowering.of("look")] == [0, 1, 3, 5, 7, 9, 11]
+    assert made.lowering.every == 2 and made.lowering.of("slow") == [(2,)]
+    assert [each[0] for each in made.lowering.of("look")] == [0, 1, 3, 5, 7, 9, 11]
     made = make(takes=[0.06, TAKES_S])
     made.lower()
     assert made.lowering.every == 1, "one late exchange may be due to a busy computer"
@@ -273,9 +289,57 @@ def test_replies_that_another_master_destroys_are_not_awaited_longer(
     """Its own replies look like late ones."""
     made = make()
     made.bus.patience = 0.003
-    made.bus.heard.strangers, made.bus.heard.late_at = strangers, 10.0 if late else -math.inf
+    # Late replies are expected for 0.1 s: the last exchange begins at 0.151 s.
+    made.bus.heard.strangers, made.bus.heard.late_at = strangers, 0.052 if late else 0.05
     made.lower()
     assert made.bus.patience == pytest.approx(awaited)
+
+
+def test_the_path_of_an_arm_that_was_not_heard_begins_where_it_was_last_seen(make: Make) -> None:
+    made = make()
+    state = made.stopped.whole
+    assert state is not None
+    first = state.time_before_write + 0.05
+    made.bus.clock.wait_until(first)
+    (told,) = made.lower(latest=state._replace(missing=(True, True), time_before_write=first - 0.004))
+    assert "was lowered" in told and [each[0] for each in made.lowering.of("look")] == [1, 2]
+    assert made.bus.times("sample") == pytest.approx([first, first + 0.05])
+
+
+@pytest.mark.parametrize(("silent", "hides", "asked"), [([2, 3], True, 1), ([2], False, 0), ([], True, 0)])
+def test_silence_of_all_is_looked_into_once(make: Make, silent: list[int], hides: bool, asked: int) -> None:
+    made = make(takes=[TAKES_S, 0.045, 0.045, TAKES_S])
+    made.bus.patience = 0.045
+    made.bus.silent, made.bus.first_hides = silent, hides
+    made.lower()
+    assert len(made.lowering.of("others answer")) == asked
+
+
+def test_exchanges_between_samples_that_would_delay_the_next_one_are_left_out(make: Make) -> None:
+    made = make(turns=2, takes=[0.03, TAKES_S])
+    made.lower()
+    first = 0.05 + TAKES_S
+    assert made.bus.times("between") == [], "the longest exchange so far took longer than is left"
+    assert made.bus.times("sample") == pytest.approx([first, first + 0.05, first + 0.1])
+    assert ("torque",) not in made.bus.calls, "no servo has raised an alert"
+
+
+def test_late_replies_leave_no_time_for_exchanges_between_samples(make: Make) -> None:
+    made = make(turns=2, takes=[0.06])
+    made.lowering.samples = 12
+    made.lower()
+    assert made.lowering.every == 2 and made.bus.times("between") == []
+
+
+def test_an_arm_that_was_pushed_off_its_path_is_lowered_along_another_one(make: Make) -> None:
+    made = make()
+    made.lowering.pushed_at = 2
+    assert made.lower() == ["The arm was lowered to its rest pose."]
+    first = 0.05 + TAKES_S
+    again = first + 0.05 + TAKES_S
+    assert [each[0] for each in made.lowering.of("look")] == [0, 1, 0, 1]
+    assert made.bus.times("sample") == pytest.approx([first, first + 0.05, again, again + 0.05])
+    assert made.lowering.of("time") == [(pytest.approx(again - first + 2 * 0.05),)]
 
 
 def test_packets_of_another_master_do_not_end_the_lowering(make: Make) -> None:
