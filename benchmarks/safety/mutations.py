@@ -161,6 +161,8 @@ EQUIVALENT = {
         "False  ->  True",
     ): "guard: after a regular exchange, one more is processed like an irregular one",
     ("if volt > 0.0 and", "0.0  ->  1.0"): "guard: no servo runs on 1 V",
+    ("self._deadline = self._sent_at = self._heard_at = 0.0", "0.0  ->  1.0"): "way_down: set when lowering begins",
+    ("if longer != 0.0", "0.0  ->  1.0"): "way_down: then 0 s longer is set, too",
     ("for _ in range(0, self._plan.end_samples", "0  ->  1"): "stream: a multiple of the window has as many steps",
     ("ticks.wait() if number else", "0.0  ->  1.0"): "stream: a value that is not used",
     ("abs(travels[-1].moved)", "-1  ->  +1"): "recent_motion: the last of two",

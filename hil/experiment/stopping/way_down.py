@@ -77,7 +77,7 @@ class WayDown:
         self._guard = guard
         self._watch = watch
         self._lowering = Lowering(config, plan, self._apart)
-        self._pace = Pace(self._interval, 0.0)
+        self._pace: Pace
         self._takes = 0.0
         self._alerts: list[bool] = []
         self._goal: list[float] = []

@@ -6,10 +6,11 @@ from typing import Any
 import pytest
 
 from hil.drivers.control_table import load_control_table
+from hil.drivers.exchange import HOST_S
 from hil.drivers.joint import Joint
 from hil.drivers.packet import BROADCAST_ID, Instruction, encode
 from hil.drivers.preparation.cadence import CHECK_S, STATUS_S, cadence, exchange_interval
-from hil.drivers.servo_model import servo_model
+from hil.drivers.servo_model import Mode, servo_model
 from hil.drivers.state import status_span
 from hil.drivers.sync_read import SyncRead, one_each
 
@@ -77,9 +78,30 @@ def test_a_status_is_read_if_the_wire_leaves_time(servos: int, model: str, share
         assert fits[:2] == (1, whole) and not_quite[:2] == (1, False if whole else None)
 
 
+def test_exchanges_leave_this_computer_time() -> None:
+    servos = 8
+    least = wire_s(servos, XM540, whole=False) / 0.6 + HOST_S
+    assert CHECK_S < 2 * least < 2 * CHECK_S
+    assert cadence_of(servos, 0.5 / (1.001 * least))[:2] == (2, False)
+    assert cadence_of(servos, 0.5 / (0.999 * least))[:2] == (1, True)
+
+
+def test_goals_of_two_kinds_take_two_packets() -> None:
+    port: Any = SimpleNamespace(wire_time=lambda count: 10 * count / BAUD)
+    both = [Joint("a", 1, servo_model(XM540)), Joint("b", 2, servo_model(XM540), mode=Mode.PWM)]
+    table = load_control_table(XM540)
+    spans = status_span([each.mode for each in both], [table] * 2, whole=False)
+    sizes = [encode(BROADCAST_ID, Instruction.SYNC_WRITE, bytes(4 + 3)) for _ in both]
+    read = SyncRead([1, 2], spans)
+    least = 10 * (sum(map(len, sizes)) + len(read.request) + read.reply_size) / BAUD / 0.6
+    assert cadence(1.001 * least, port, both, [table] * 2, 0.0)[1] is not None
+    assert cadence(0.999 * least, port, both, [table] * 2, 0.0)[1] is None
+
+
 def test_a_slow_bus_allows_fewer_exchanges() -> None:
     assert cadence_of(2, 20.0)[0] == 5
     assert cadence_of(2, 20.0, baud=57_600)[0] == 1
+    assert cadence_of(20, 60.0) == (1, None, 0)
 
 
 def test_without_a_known_rate_there_is_one_exchange_and_no_status() -> None:

@@ -306,7 +306,9 @@ def test_the_path_of_an_arm_that_was_not_heard_begins_where_it_was_last_seen(mak
     assert made.bus.times("sample") == pytest.approx([first, first + 0.05])
 
 
-@pytest.mark.parametrize(("silent", "hides", "asked"), [([2, 3], True, 1), ([2], False, 0), ([], True, 0)])
+@pytest.mark.parametrize(
+    ("silent", "hides", "asked"), [([2, 3], True, 1), ([1], True, 1), ([2], False, 0), ([], True, 0)]
+)
 def test_silence_of_all_is_looked_into_once(make: Make, silent: list[int], hides: bool, asked: int) -> None:
     made = make(takes=[TAKES_S, 0.045, 0.045, TAKES_S])
     made.bus.patience = 0.045
