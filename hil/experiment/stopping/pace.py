@@ -36,7 +36,7 @@ class Pace:
         self._quickest = min(patience, quickest)
         self._longest = 0.0
         self._first = self._usual = max(patience, min(patience + LONGER_S, LONGEST_S))
-        self._was_late = False
+        self._was_late = self._is_longer = False
         self.every = 1
         """Number of samples per exchange."""
 
@@ -49,7 +49,10 @@ class Pace:
         if not are_late and not self._was_late:
             # Lost replies are asked for again soon; the last exchange before the limit waits for late ones.
             is_last = not are_damaged and unheard + self._quickest > BRIDGED_ALONE_S
-            return self._usual if is_last else min(max(self._quickest, self._longest + MARGIN_S), self._usual)
+            # Whoever destroys replies periodically must not meet every request.
+            self._is_longer = are_damaged and not self._is_longer
+            shortest = self._least if self._is_longer else self._quickest
+            return self._usual if is_last else min(max(shortest, self._longest + MARGIN_S), self._usual)
         return max(min(max(self._least, LONGEST_S), LAST_S - unheard), LONGER_S)
 
     def took(self, seconds: float, *, missed: bool) -> None:

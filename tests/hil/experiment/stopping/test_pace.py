@@ -73,6 +73,13 @@ def test_at_low_rates_lost_replies_are_awaited_only_as_long_as_they_usually_take
     assert pace.patience(0.018, are_late=False) == pytest.approx(max(awaited, 0.0055))
 
 
+def test_destroyed_replies_are_asked_for_again_after_unequal_times() -> None:
+    """Whoever destroys them every 4 ms does not meet every request."""
+    pace = Pace(0.0125, 0.009, 0.004)
+    awaited = [pace.patience(0.02, are_late=False, are_damaged=True) for _ in range(4)]
+    assert awaited == pytest.approx([0.009, 0.004, 0.009, 0.004])
+
+
 def test_replies_that_have_taken_longer_are_awaited_as_long() -> None:
     pace = Pace(0.02, 0.003)
     pace.took(0.006, missed=False)
