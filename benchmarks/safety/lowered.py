@@ -22,8 +22,9 @@ from hil.drivers.errors import DriverError
 from hil.errors import ExperimentError
 from hil.experiment.run import run_experiment
 from hil.runs.run_folder import RunFolder
+from tests.support.edits import replaced
+from tests.support.paths import CONFIGS
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 NAME, URDF = "fake_open_manipulator_x.toml", "open_manipulator_x_like.urdf"
 RATES = (100, 133, 200, 250, 400)
 SILENT_MS = (16, 20, 24, 28, 50)
@@ -33,9 +34,12 @@ POLLS_MS = (2, 4, 10)
 
 def outcome(rate: int, fault: str) -> str:
     """Run the arm with this fault; return "lowered", "fell" or "went on"."""
-    text = (CONFIGS / NAME).read_text(encoding="utf-8")
-    text = text.replace("period = 10.0", "period = 5.0").replace("rate = 400.0", f"rate = {rate}.0")
-    text = text.replace("[fake.chain]\n", f"[[fake.faults]]\n{fault}\n[fake.chain]\n", 1)
+    text = replaced(
+        (CONFIGS / NAME).read_text(encoding="utf-8"),
+        ("period = 10.0", "period = 5.0"),
+        ("rate = 400.0", f"rate = {rate}.0"),
+        ("[fake.chain]\n", f"[[fake.faults]]\n{fault}\n[fake.chain]\n"),
+    )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / URDF).write_bytes((CONFIGS / URDF).read_bytes())

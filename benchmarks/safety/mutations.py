@@ -160,6 +160,10 @@ EQUIVALENT = {
         "self._was_irregular = False",
         "False  ->  True",
     ): "guard: after a regular exchange, one more is processed like an irregular one",
+    (
+        "np.load(path, allow_pickle=False, mmap_mode",
+        "False  ->  True",
+    ): "recording: no pickle can be mapped into memory",
     ("if volt > 0.0 and", "0.0  ->  1.0"): "guard: no servo runs on 1 V",
     ("self._deadline = self._sent_at = self._heard_at = 0.0", "0.0  ->  1.0"): "way_down: set when lowering begins",
     ("if longer != 0.0", "0.0  ->  1.0"): "way_down: then 0 s longer is set, too",

@@ -115,6 +115,11 @@ def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
     return cut
 
 
+def cut_goals(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
+    """Return the goals that the limits keep from being restored, each clamped. Raises the errors of `Servo.read`."""
+    return {name: value for name, value in attainable(servo, settings).items() if value != settings[name]}
+
+
 def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, int]]:
     """Restore the registers that differ from `settings`; return their old and new values by name.
 

@@ -1,12 +1,14 @@
 """Conversion of exceptions to messages and exit codes."""
 
 import errno
-from typing import Any
+from typing import Any, TypeVar
 
 import typer
 from typer.core import TyperCommand
 
 from hil.toml_file import shortened
+
+_E = TypeVar("_E", bound=BaseException)
 
 _OF_THE_MACHINE = frozenset({errno.EMFILE, errno.ENFILE})
 """Operating-system errors that are not due to the input: too many open files."""
@@ -83,7 +85,12 @@ def stop_behind(error: BaseException) -> Exception | None:
     """
     from hil.errors import StopRequested
 
-    seen: BaseException | None = error if isinstance(error, OSError) else None
-    while seen is not None and not isinstance(seen, StopRequested):
+    return handled_behind(error, StopRequested) if isinstance(error, OSError) else None
+
+
+def handled_behind(error: BaseException, kind: type[_E]) -> _E | None:
+    """Return `error` or the exception that was being handled when it was raised, and so on, if one is of this kind."""
+    seen: BaseException | None = error
+    while seen is not None and not isinstance(seen, kind):
         seen = seen.__context__
     return seen

@@ -16,6 +16,7 @@ from typing import Any
 
 import typer
 
+from hil.cli.errors import handled_behind
 from hil.next_step import next_step
 
 _CLOSED = frozenset({errno.EIO, errno.EPIPE})
@@ -57,12 +58,9 @@ def _interruption(raised: BaseException) -> KeyboardInterrupt | None:
 
     A terminal that is closed sends SIGHUP and then rejects all output, for example the end of a progress bar.
     """
-    seen: BaseException | None = raised
     if isinstance(raised, OSError) and raised.errno not in _CLOSED:
         return None
-    while seen is not None and not isinstance(seen, KeyboardInterrupt):
-        seen = seen.__context__
-    return seen
+    return handled_behind(raised, KeyboardInterrupt)
 
 
 def how_to_go_on(stopped: BaseException) -> list[str]:

@@ -262,7 +262,7 @@ def load_samples(path: Path, joints: int) -> NDArray[np.void]:
     """The recorded rows of a `samples.npy`, which may come from a process that was killed. Raises RunFolderError."""
     try:
         check_array(path)
-        samples = np.load(path, mmap_mode="r")
+        samples = np.load(path, allow_pickle=False, mmap_mode="r")
     except (OSError, ValueError, EOFError) as error:
         raise RunFolderError(f"{path} cannot be read as a recording: {str(error).rstrip('.')}.") from error
     expected = sample_type(joints)

@@ -138,11 +138,11 @@ class WayDown:
         """
         since = self._clock.now() - whole.time_before_write
         asked = latest.time_before_write - whole.time_before_write
-        if since > BRIDGED_S:
-            return True
-        if since <= BRIDGED_ALONE_S or (asked <= BRIDGED_ALONE_S and since <= BRIDGED_ALONE_S + LONGER_S):
+        if asked <= BRIDGED_ALONE_S and since <= BRIDGED_ALONE_S + LONGER_S:
             return False
-        return not all(latest.missing) or (len(latest.missing) > 1 and self._bus.first_hides_others(LONGER_S))
+        if since > BRIDGED_S or not all(latest.missing):
+            return True
+        return len(latest.missing) > 1 and self._bus.first_hides_others(LONGER_S)
 
     def _follow(self, state: State, stopped: Stopped) -> State:
         """Follow the path to the rest pose; return the last complete state.

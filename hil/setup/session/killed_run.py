@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from hil.drivers.errors import NoReply, TorqueHeld
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import LIMIT_OF_GOAL, attainable, put_back, read_settings
+from hil.drivers.preparation.settings import LIMIT_OF_GOAL, attainable, cut_goals, put_back, read_settings
 from hil.drivers.servo import Servo
 from hil.setup.session import settings_file
 from hil.setup.session.settings_file import Kept
@@ -199,13 +199,12 @@ def recover(servo: Servo, port: str) -> Restored:
     left = what_is_left(kept, servo, read_settings(servo))
     written = put_back(servo, left.wanted)
     others = [left.others] if left.changed else []
-    for name, value in attainable(servo, left.wanted).items():
-        if value != (wanted := left.wanted[name]):
-            others.append(
-                f"its {name} is {value} and was {wanted} before the run of {kept.since}, because its "
-                f"{LIMIT_OF_GOAL[name]} does not allow more. Another program changed this limit; once it has been set "
-                "back with DYNAMIXEL Wizard 2.0, the next hil check restores the goal."
-            )
+    others += [
+        f"its {name} is {value} and was {left.wanted[name]} before the run of {kept.since}, because its "
+        f"{LIMIT_OF_GOAL[name]} does not allow more. Another program changed this limit; once it has been set back "
+        "with DYNAMIXEL Wizard 2.0, the next hil check restores the goal."
+        for name, value in cut_goals(servo, left.wanted).items()
+    ]
     if not others:
         settings_file.forget(kept)
     told = [f"{name} {before} -> {after}" for name, (before, after) in written.items()]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, WrongModel, WrongSetting
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import PROTECTIVE, attainable, put_back, read_settings, unlike
+from hil.drivers.preparation.settings import PROTECTIVE, cut_goals, put_back, read_settings, unlike
 from hil.drivers.servo import Servo
 from hil.drivers.torque.held import Originals
 from hil.errors import RunFolderError
@@ -126,8 +126,7 @@ class SavedSettings:
                 self._check_model(servo)
                 written = put_back(servo, settings)
                 self._note_foreign(joint, written)
-                possible = attainable(servo, settings)
-                self.reduced[joint] = {name: value for name, value in possible.items() if value != settings[name]}
+                self.reduced[joint] = cut_goals(servo, settings)
             except DriverError as error:
                 failed[joint] = error
         return failed
